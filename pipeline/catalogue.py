@@ -1,18 +1,18 @@
 """Catalogue of stages and experiments: the module of each stage, and what a scene needs to run an experiment.
 
 The file dvc.yaml runs a stage with the command `python -m pipeline STAGE --scene SCENE ...`. `STAGES` lists the stages
-of package `pipeline.stages` by module. In addition, each experiment in `pipeline.experiments` is a stage of its own: a
-function with the name of the experiment, in the module of the same name.
+of package `pipeline.stages` by module. In addition, each experiment in `ANALYSED` is a stage of its own: a function
+with the name of the experiment, in the module of the same name in `pipeline.experiments`.
 """
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
-from typing import Literal
-
-from reskin.config import Strict
+from typing import Any, Literal
 
 STAGES = {
-    "simulate": ("simulate",),
+    "simulate": ("physics", "simulate"),
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
     "train": ("train_single", "train_multi", "train_triplet", "adapt"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
@@ -24,14 +24,14 @@ EXPERIMENTS_PACKAGE = "pipeline.experiments"
 Kind = Literal["models", "files", "curve", "analysis", "report"]
 
 
-class Experiment(Strict):
+@dataclass(frozen=True)
+class Experiment:
     """An experiment that scenes can run, and its requirements for a scene.
 
-    kind: what the stage writes. `models`: networks with JSON cards. `files`: model files that other experiments score.
-    `curve`: points of a curve. `analysis`: numbers, figure data and capture losses. `report`: nothing, because the
-    report stage computes it. Each analysis is a module of `pipeline.experiments`.
     stage: the DVC stage that runs the experiment.
-    key: the name of the results in numbers.json; it stays the same if the experiment is renamed.
+    kind: what the stage writes. `models`: networks with JSON cards. `files`: model files that other experiments score.
+        `curve`: points of a curve. `analysis`: numbers, figure data and capture losses. `report`: nothing, because the
+        report stage computes it.
     needs: other experiments that the scene must also run.
     protocol: the simulated protocol whose captures the experiment reads; None for the main protocol.
     folds: the keys of the scene's section `split` that set how the experiment's folds are drawn; None if no folds are
@@ -40,47 +40,35 @@ class Experiment(Strict):
     reads: sections of the scene that the experiment reads besides its own.
     file: the key of the experiment's section that names a file on which the stage depends; None if there is none.
     recorded: whether scenes with recorded captures may run the experiment.
-    without_contact: whether the experiment reads recordings in which nothing touches the skin.
+    without_contact: whether the experiment reads recordings in which nothing touches the skin. It needs neither folds
+        nor places in mm, so that a scene may run it without any other experiment.
     scores: whether the stage writes rows of the table of scores.
-    alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
     """
 
     name: str
     stage: str
-    key: str
-    kind: Kind = "analysis"
+    kind: Kind
     needs: tuple[str, ...] = ()
     protocol: str | None = None
     folds: tuple[str, ...] | None = None
-    settings: bool = False
+    settings: bool = True
     reads: tuple[str, ...] = ()
     file: str | None = None
     recorded: bool = False
     without_contact: bool = False
     scores: bool = False
-    alone: bool = False
 
 
-def _learning(
-    name: str, kind: Kind, stage: str, *, needs: tuple[str, ...] = (), folds: tuple[str, ...] | None = None,
-    settings: bool = True, reads: tuple[str, ...] = (), file: str | None = None,
-) -> Experiment:  # fmt: skip
-    return Experiment(
-        name=name,
-        stage=stage,
-        key=name,
-        kind=kind,
-        needs=needs,
-        folds=folds,
-        settings=settings,
-        recorded=True,
-        scores=kind in ("models", "curve"),
-        reads=reads,
-        file=file,
-    )
+def _learning(name: str, kind: Kind, stage: str, **more: Any) -> Experiment:
+    return Experiment(name, stage, kind, recorded=True, scores=kind in ("models", "curve"), **more)
+
+
+def _analysis(name: str, **more: Any) -> Experiment:
+    return Experiment(name, name, "analysis", **more)
 
 
 RANDOM = ("random_test_fraction", "random_repeats_n")
+ADAPTED = ("lobo", "triplet", "adapt")
 LEARNING = (
     _learning("single_random", "models", "train_single", folds=RANDOM),
     _learning("single_indentation", "models", "train_single", folds=RANDOM),
@@ -96,21 +84,8 @@ LEARNING = (
         settings=False,
     ),
     _learning("rig", "files", "rig", reads=("compare",)),
-    _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
+    _learning("choice", "report", "report", needs=ADAPTED, settings=False),
 )  # fmt: skip
-
-
-def _analysis(
-    name: str, *, needs: tuple[str, ...] = (), protocol: str | None = None, settings: bool = True,
-    reads: tuple[str, ...] = (), file: str | None = None, recorded: bool = False, scores: bool = False,
-    without_contact: bool = False, alone: bool = False,
-) -> Experiment:  # fmt: skip
-    return Experiment(
-        name=name, stage=name, key=name, needs=needs, protocol=protocol, settings=settings, reads=reads, file=file,
-        recorded=recorded, scores=scores, without_contact=without_contact, alone=alone,
-    )  # fmt: skip
-
-
 ANALYSED = (
     _analysis("accuracy_and_cost", needs=("adapt",)),
     _analysis("audit", needs=("lobo",), recorded=True),
@@ -119,7 +94,7 @@ ANALYSED = (
     _analysis("extremes"),
     _analysis("flexible", needs=("adapt",), protocol="flexible", settings=False, scores=True),
     _analysis("gripper", needs=("lobo",), protocol="grip"),
-    _analysis("interference", recorded=True, scores=True, without_contact=True, alone=True),
+    _analysis("interference", recorded=True, scores=True, without_contact=True),
     _analysis("logs", needs=("lobo",), protocol="log", settings=False),
     _analysis("manual", needs=("adapt",), protocol="hand", settings=False, scores=True),
     _analysis(
@@ -132,6 +107,13 @@ ANALYSED = (
 )
 EXPERIMENTS = {experiment.name: experiment for experiment in (*LEARNING, *ANALYSED)}
 ANALYSES = tuple(experiment.name for experiment in ANALYSED)
+
+
+def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
+    """Return the stages that run the named experiments of the given kinds, in the order of the catalogue."""
+    chosen = set(names)
+    found = (one.stage for one in EXPERIMENTS.values() if one.name in chosen and one.kind in kinds)
+    return list(dict.fromkeys(found))
 
 
 def is_stage(name: str) -> bool:

@@ -17,7 +17,8 @@ from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
 if TYPE_CHECKING:
-    from pipeline.scenes import Plan, Source
+    from pipeline.plan import Plan
+    from pipeline.scenes import Source
 
 ROOT = Path()  # the checkout, which is the working directory
 
@@ -109,13 +110,6 @@ def add(
             "the name of each file."
         ),
     ] = None,
-    like: Annotated[
-        str | None,
-        Option(
-            help="Create the scene as a copy of this recorded scene (ini, lab, ...), with the same settings. Only if "
-            "the scene does not exist yet."
-        ),
-    ] = None,
     name: Annotated[
         str | None,
         Option(help="Name of the recording in the scene. Default: the name is made from the board and the skin."),
@@ -165,15 +159,14 @@ def add(
         ),
     ] = False,
 ) -> None:
-    """Add recordings to a scene, so that the next `dvc repro` uses them.
+    """Add recordings to a scene. `dvc repro` uses them if the scene is in the plan (`reskin scenes use`).
 
     If one of the recordings cannot be added, none of them is added.
     """
-    from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.manage.lock import changing
     from pipeline.manage.options import Options
-    from pipeline.scenes import read_plan
+    from pipeline.plan import next_command
     from reskin.recordings.preparing import CaptureNames, suggesting_layout
 
     options = Options(probe, mark, chips_n, rate_hz, wire, rows_late, force_axis, pad)
@@ -183,17 +176,14 @@ def add(
             n = len(recordings)
             raise ParamsError(f"{option} is for one recording, but there are {n}. Add each with a command of its own.")
     added: list[str] = []
-    with changing(ROOT), plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
-        planned = read_plan(ROOT / PLAN).scenes
+    with changing(ROOT), adding.undoing(ROOT, scene, added):
         for recording in recordings:
             names = adding.names_of(ROOT, scene, recording, CaptureNames(board or "", skin or "", name))
             with suggesting_layout(recording, layout):
                 header = adding.add(ROOT, scene, options.prepare(recording, layout, names), allow_copy=allow_copy)
             added.append(header.capture)
             typer.echo(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
-    typer.echo(f"next: dvc repro report@{scene}")
-    if scene not in planned:
-        typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(planned) or 'none'})")
+    typer.echo(f"next: {next_command(ROOT, scene)}")
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -287,10 +277,10 @@ def readme(
 @scenes.command("list")
 def list_scenes() -> None:
     """List all scenes. A star marks the scenes that `dvc repro` runs."""
-    from pipeline import plan
+    from pipeline.scenes import scene_names
 
     planned = checked_plan().scenes
-    for name in plan.scene_names(ROOT):
+    for name in scene_names(ROOT):
         typer.echo(f"{'*' if name in planned else ' '} {name}")
 
 
@@ -307,19 +297,13 @@ def use(
     with changing(ROOT):
         plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
-    for sentence in plan.unused_settings(ROOT, names):
-        typer.echo(f"note: {sentence}")
 
 
 @scenes.command()
 def check() -> None:
     """Check the settings of the scenes that `dvc repro` runs, and whether pipeline/plan.yaml is up to date."""
-    from pipeline import plan
-
     names = list(checked_plan().scenes)
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(names) or 'none'}")
-    for sentence in plan.unused_settings(ROOT, names):
-        typer.echo(f"note: {sentence}")
 
 
 @models.command("make")

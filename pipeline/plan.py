@@ -1,82 +1,68 @@
 """Generate pipeline/plan.yaml, which lists the scenes that DVC runs and the items for which each DVC stage runs."""
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 
 from pipeline import PLAN, SCENES
-from pipeline.catalogue import ANALYSES, EXPERIMENTS
+from pipeline.catalogue import ANALYSES, EXPERIMENTS, Experiment, stages
 from pipeline.manage.registry import Registry, read_registry
-from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
+from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Scene, read_scene, scene_file
 from reskin import io
-from reskin.errors import ParamsError, did_you_mean
-from reskin.recordings.header import NAME, NAME_RULE
+from reskin.config import Strict, parse, read_yaml
+from reskin.errors import ParamsError
 
 HEADER = """\
 # The scenes that `dvc repro` runs, and the items (scenes, captures or folders) for which each stage of dvc.yaml runs.
-# Do not edit: `reskin scenes use` and `reskin add` write this file from pipeline/scenes and data/captures.yaml.
+# Do not edit: `reskin scenes use` writes this file from pipeline/scenes and data/captures.yaml.
 """
 MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
 NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the robot; their experiments read the raw captures
 
 
-def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
-    """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
+class Plan(Strict):
+    """Content of `pipeline/plan.yaml`, which states what `dvc repro` runs.
 
-    DVC runs a stage once for each of its items:
-    - For most stages, the items are names of scenes.
-    - For `simulate` and `ingest_simulated`, the items are folders of captures. Each protocol of a scene has one folder.
-    - For `ingest`, the items are recorded captures.
-    - An experiment such as `drift` reads the captures of its own protocol in a simulated scene, and the main captures
-      in a recorded scene. The items of such an experiment are pairs of a scene and the folder with these captures.
+    - scenes: the experiments of each planned scene.
+    - captures: the recorded captures of each scene.
+    - held_out: the experiments of each scene for which folds are drawn.
+    - models: the stages of each scene that write models.
+    - stages: the items for which each stage runs: names of scenes, recorded captures (`ingest`), folders with the
+      captures of a simulated protocol (`simulate`, `ingest_simulated`), or scenes with a folder or file (`drift`).
     """
+
+    scenes: dict[str, tuple[str, ...]]
+    captures: dict[str, tuple[str, ...]]
+    held_out: dict[str, tuple[str, ...]]
+    models: dict[str, tuple[str, ...]]
+    stages: dict[str, Any]
+
+
+def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
+    """Derive the plan for these scenes."""
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
         if scene.simulate is None and not captures[name]:
             remedy = f"Add recordings to the scene: reskin add RECORDING --scene {name} ..."
             raise ParamsError(f"scene {name} has no recorded captures. {remedy}")
-    many = [name for name in scenes if len(captures[name]) > MANY_N]
-    pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
-    ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
-    if len(ingest) < len(pairs):
-        raise ParamsError(
-            "stage ingest: two captures have the same name, which is made from scene and capture (SCENE-CAPTURE). "
-            "Rename one of the scenes."
-        )
-    simulate: dict[str, dict[str, str]] = {}
-    ingest_simulated: dict[str, str] = {}
-    for name, scene in scenes.items():
-        protocols = scene.simulate.protocols if scene.simulate else {}
-        for protocol, settings in protocols.items():
-            if protocol not in scene.protocols:
-                continue
-            folder = _folder(name, protocol)
-            if folder in simulate or (folder in scenes and folder != name):
-                what = f"protocol {protocol} would use folder {folder}, which another scene or protocol uses too"
-                raise ParamsError(f"scene {name}: {what}. Rename one of the two.")
-            simulate[folder] = {"scene": name, "protocol": protocol}
-            if settings.kind not in NOT_INGESTED:
-                ingest_simulated[folder] = name
+    simulate = _protocols(scenes)
     items: dict[str, Any] = {
-        "simulate": simulate, "ingest_simulated": ingest_simulated, "ingest": ingest, "ingest_many": many,
-        "describe": list(scenes), "split": list(scenes),
-    }  # fmt: skip
+        "physics": [name for name, scene in scenes.items() if scene.simulate],
+        "simulate": {folder: {"scene": name, "protocol": protocol} for folder, (name, protocol, _) in simulate.items()},
+        "ingest_simulated": {folder: name for folder, (name, _, kind) in simulate.items() if kind not in NOT_INGESTED},
+        "ingest": _recorded({name: of_scene for name, of_scene in captures.items() if len(of_scene) <= MANY_N}),
+        "ingest_many": [name for name, of_scene in captures.items() if len(of_scene) > MANY_N],
+        "describe": list(scenes),
+        "split": list(scenes),
+    }
     for stage in (*stages(EXPERIMENTS, "models", "files", "curve"), *ANALYSES):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
     for experiment in EXPERIMENTS.values():
-        if experiment.protocol is not None and experiment.recorded:
-            items[experiment.stage] = {
-                name: _folder(name, experiment.protocol) if scenes[name].simulate else name
-                for name in items[experiment.stage]
-            }
-        if experiment.file is not None:
-            items[experiment.stage] = {
-                name: scenes[name].named_file(experiment.name) for name in items[experiment.stage]
-            }
+        if experiment.file is not None or (experiment.protocol is not None and experiment.recorded):
+            items[experiment.stage] = {name: _input(name, scenes[name], experiment) for name in items[experiment.stage]}
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items["report"] = list(scenes)
     return {
@@ -88,61 +74,61 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     }
 
 
+def _protocols(scenes: Mapping[str, Scene]) -> dict[str, tuple[str, str, str]]:
+    """Return the folder of each simulated protocol, with its scene, its name and its kind."""
+    found: dict[str, tuple[str, str, str]] = {}
+    for name, scene in scenes.items():
+        of_scene = scene.simulate.protocols if scene.simulate else {}
+        for protocol in [protocol for protocol in of_scene if protocol in scene.protocols]:
+            folder = _folder(name, protocol)
+            if folder in found or (folder in scenes and folder != name):
+                what = f"protocol {protocol} would use folder {folder}, which another scene or protocol uses too"
+                raise ParamsError(f"scene {name}: {what}. Rename one of the two.")
+            found[folder] = (name, protocol, of_scene[protocol].kind)
+    return found
+
+
+def _recorded(captures: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
+    pairs = [(name, capture) for name, of_scene in captures.items() for capture in of_scene]
+    named = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
+    if len(named) < len(pairs):
+        problem = "two captures have the same name, which is made from scene and capture (SCENE-CAPTURE)"
+        raise ParamsError(f"stage ingest: {problem}. Rename one of the scenes.")
+    return named
+
+
 def _folder(scene: str, protocol: str) -> str:
     return scene if protocol == MAIN_PROTOCOL else f"{scene}-{protocol}"
 
 
-def scene_names(root: Path) -> list[str]:
-    if not (root / SCENES).is_dir():
-        raise ParamsError(f"{root / SCENES}: folder not found. Run the command in the folder of the checkout.")
-    return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
+def _input(name: str, scene: Scene, experiment: Experiment) -> str:
+    """Return the file that a scene names for an experiment, or the folder of the captures that the experiment reads."""
+    if experiment.file is not None:
+        return scene.named_file(experiment)
+    assert experiment.protocol is not None
+    return _folder(name, experiment.protocol) if scene.simulate else name
 
 
-def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/add-a-scene.md.") -> Path:
-    """Return the file of a scene; raise `ParamsError` if there is none."""
-    known = scene_names(root)
-    if name not in known:
-        guess = did_you_mean(name, known)
-        raise ParamsError(f"no scene {name}.{guess} The scenes are: {', '.join(known)}. {remedy}")
-    return root / SCENES / f"{name}.yaml"
-
-
-@contextmanager
-def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
-    """Create scene `name` as a copy of scene `like`; delete the copy if the `with` block fails.
-
-    If `like` is None, nothing is created. Comments are copied, except those above the first setting, because they
-    describe scene `like`.
-    """
-    if like is None:
-        yield
-        return
-    if not re.fullmatch(NAME, name):
-        raise ParamsError("--scene", "a name", NAME_RULE, repr(name), "Choose another name.")
-    original = scene_file(root, like)
-    target = original.with_name(f"{name}.yaml")
-    if target.exists():
-        remedy = "To add the recording to this scene, omit --like."
-        raise ParamsError(f"--like {like}: scene {name} exists already. {remedy}")
-    lines = original.read_text(encoding="utf-8").splitlines(keepends=True)
-    first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-    header = f"# Scene {name}: a copy of scene {like}, by `reskin add --like`.\n"
-    io.write_text(target, "".join([header, *lines[first_i:]]))
-    try:
-        yield
-    except BaseException:
-        io.remove(target)
-        raise
+def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Derive the plan for these scenes of a checkout."""
+    scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
+    for name, scene in scenes.items():
+        for one in (one for one in scene.entries if one.file is not None):
+            if not (root / (file := scene.named_file(one))).is_file():
+                problem = f"file {file}, which is named in section {one.stage}, was not found"
+                remedy = f"Make the file with: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
+                raise ParamsError(
+                    f"{scene_file(root, name)}: {problem}. {remedy}, or remove {one.name} from the experiments."
+                )
+    return make_plan(scenes, read_registry(root))
 
 
 def use(root: Path, names: Sequence[str]) -> None:
     """Write the plan for exactly these scenes."""
-    yaml = YAML()
-    yaml.width = 120
-    document = {key: _in_flow_style(value) for key, value in plan_of(root, names).items()}
+    plan = plan_of(root, names)
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
-        yaml.dump(document, stream)
+        YAML().dump(plan, stream)
     _keep_outputs(root)
 
 
@@ -161,6 +147,10 @@ def _keep_outputs(root: Path) -> None:
         repo.state.links.clear()
 
 
+def read_plan(path: Path) -> Plan:
+    return parse(Plan, read_yaml(path), str(path))
+
+
 def check(root: Path) -> Plan:
     """Read the plan; raise `ParamsError` if the plan is out of date, or if a scene or params.yaml is invalid."""
     plan = read_plan(root / PLAN)
@@ -171,38 +161,6 @@ def check(root: Path) -> Plan:
     return plan
 
 
-def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Derive the plan for these scenes of a checkout."""
-    scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
-    for name, scene in scenes.items():
-        for experiment in scene.entries:
-            if experiment.file is not None and not (root / scene.named_file(experiment.name)).is_file():
-                file = scene.named_file(experiment.name)
-                remedy = f"Make the file with: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
-                problem = f"file {file}, which is named in section {experiment.stage}, was not found"
-                raise ParamsError(
-                    f"{scene_file(root, name)}: {problem}. {remedy}, or remove {experiment.name} from the experiments."
-                )
-    return make_plan(scenes, read_registry(root))
-
-
-def unused_settings(root: Path, names: Sequence[str]) -> list[str]:
-    """Describe, for each of these scenes, the settings that none of its experiments reads."""
-    unused = {name: read_scene(root, name).unused for name in names}
-    return [f"{scene_file(root, name)}: no experiment reads {', '.join(keys)}" for name, keys in unused.items() if keys]
-
-
-def _in_flow_style(value: Any) -> Any:
-    """Make ruamel write lists, and mappings whose values are all strings, in flow style (`[a, b]`, `{a: b}`)."""
-    from ruamel.yaml.comments import CommentedMap, CommentedSeq
-
-    if isinstance(value, list):
-        sequence = CommentedSeq(value)
-        sequence.fa.set_flow_style()
-        return sequence
-    if isinstance(value, dict):
-        mapping = CommentedMap({key: _in_flow_style(item) for key, item in value.items()})
-        if all(isinstance(item, str) for item in value.values()):
-            mapping.fa.set_flow_style()
-        return mapping
-    return value
+def next_command(root: Path, scene: str) -> str:
+    """Return the command that runs a scene: plain `dvc repro` if the scene is in the plan."""
+    return "dvc repro" if scene in read_plan(root / PLAN).scenes else f"reskin scenes use {scene} && dvc repro"

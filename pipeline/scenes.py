@@ -1,13 +1,13 @@
-"""Validate scenes (`pipeline/scenes/*.yaml`), `params.yaml` and the plan; list the experiments that a scene runs."""
+"""Validate scenes (`pipeline/scenes/*.yaml`) and `params.yaml`; list the experiments that a scene runs."""
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline import PARAMS
-from pipeline.catalogue import EXPERIMENTS, Experiment, Kind, module_of
+from pipeline import PARAMS, SCENES
+from pipeline.catalogue import EXPERIMENTS, Experiment, module_of, stages
 from pipeline.settings import Seed, Settings, read_settings, section_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
@@ -20,8 +20,6 @@ MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
 # The rows of table 2, each with the experiment that provides its scores. If a scene runs all four experiments, stage
 # table2 writes this table as soon as they are done, before the report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
-
-WHOLE = "the scene"  # in messages about unused settings: the place of settings that are whole sections of the scene
 # Experiments and sections that no longer exist, by the experiment that replaces them.
 REPLACED = {
     "new_board": ("labels", "few_labels", "calibrated", "random_presses", "reference_methods", "recorded_limits"),
@@ -30,51 +28,28 @@ REPLACED = {
     "extremes": ("verification", "stability"),
     "accuracy_and_cost": ("runtime", "neglected_effects"),
 }
-KEPT = {"pool_passes_n"}  # settings that have an effect even if the scene does not run the experiment that needs them
-
 SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experiment.settings}
-
-
-def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
-    """Return the stages that run the named experiments of the given kinds, in the order of the catalogue."""
-    chosen = set(names)
-    return list(
-        dict.fromkeys(
-            experiment.stage
-            for experiment in EXPERIMENTS.values()
-            if experiment.name in chosen and experiment.kind in kinds
-        )
-    )
-
-
-SharedRow = dict[str, Any]  # a row without `steps_n`, which each scene sets
-SHARED_ROWS: dict[str, type[Schedule]] = {
-    "recipes": Recipe,
-    "adaptations": AdaptationRecipe,
-}
 Source = Literal["simulated", "recorded"]
 
 
-class ProtocolSummary(Strict, extra="allow"):
-    """The settings of a protocol that the plan needs: its kind, its boards, and its physics terms."""
+class Protocol(Strict, extra="allow"):
+    """The setting of a protocol that the plan needs; `pipeline.simulation` checks the others."""
 
     kind: str
-    boards: str
-    terms: tuple[str, ...]
 
 
-class Simulation(Strict):
-    """The part of section `simulate` that the plan needs; `pipeline.simulation` checks the whole section."""
+class Simulation(Strict, extra="allow"):
+    """The part of section `simulate` that the plan needs."""
 
-    boards: dict[str, dict[str, Any]]
-    protocols: Annotated[dict[str, ProtocolSummary], Field(min_length=1)]
+    protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
 
 
 class Scene(Strict, extra="allow"):
     """A scene: captures (recorded or simulated readings), experiments on them, and the settings of the experiments.
 
     The captures of a simulated scene are simulated according to section `simulate`. A simulated scene without this
-    section consists of recordings of emulated boards, which were added to the scene.
+    section consists of recordings of emulated boards, which were added to the scene. Settings that no experiment of the
+    scene reads are allowed, so that an experiment can be removed from the scene without its settings.
     """
 
     source: Source
@@ -92,12 +67,12 @@ class Scene(Strict, extra="allow"):
 
     @property
     def analyses(self) -> tuple[str, ...]:
-        return tuple(experiment.name for experiment in self.entries if experiment.kind == "analysis")
+        return tuple(one.name for one in self.entries if one.kind == "analysis")
 
     @property
     def with_folds(self) -> tuple[str, ...]:
         """The experiments for which folds are drawn."""
-        return tuple(experiment.name for experiment in self.entries if experiment.folds is not None)
+        return tuple(one.name for one in self.entries if one.folds is not None)
 
     @property
     def model_stages(self) -> list[str]:
@@ -107,52 +82,21 @@ class Scene(Strict, extra="allow"):
     @property
     def scored_stages(self) -> list[str]:
         """The stages that write rows of the table of scores."""
-        return list(dict.fromkeys(experiment.stage for experiment in self.entries if experiment.scores))
+        return list(dict.fromkeys(one.stage for one in self.entries if one.scores))
 
     @property
     def curves(self) -> dict[str, str]:
         """The stage of each experiment of kind `curve`, by experiment."""
-        of_curves = (experiment for experiment in EXPERIMENTS.values() if experiment.kind == "curve")
-        return {experiment.name: experiment.stage for experiment in of_curves if experiment.name in self.experiments}
+        return {one.name: one.stage for one in EXPERIMENTS.values() if one.kind == "curve" and one in self.entries}
 
     @property
     def protocols(self) -> set[str]:
         """The protocols that a simulated scene needs for its experiments."""
-        return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
+        return {MAIN_PROTOCOL} | {one.protocol for one in self.entries if one.protocol is not None}
 
-    def named_file(self, experiment: str) -> str:
-        """Return the path of the file that is given in the settings of an experiment, relative to the checkout.
-
-        If none is given, this is `params.yaml`, on which the experiment depends in any case.
-        """
-        entry = EXPERIMENTS[experiment]
-        return str((self.model_extra or {})[entry.stage].get(entry.file) or PARAMS)
-
-    @property
-    def unused(self) -> list[str]:
-        """The settings that no experiment of the scene reads, by their place in the scene's file, such as `drift`.
-
-        Unused settings change nothing, so an experiment can be removed from a scene without removing its settings.
-        One setting is never listed: `split.pool_passes_n`, the number of passes from which pokes for adaptation are
-        drawn. It has an effect even without adaptation, because these passes are not in the test rows of other
-        experiments.
-        """
-        unread = {place: sorted(have - want - KEPT) for place, (have, want) in self._settings_by_place.items()}
-        return [name if place == WHOLE else f"{place}.{name}" for place, names in unread.items() for name in names]
-
-    @property
-    def _settings_by_place(self) -> dict[str, tuple[Set[str], Set[str]]]:
-        """The settings that the scene has, and the settings that its experiments need, by place in the scene's file."""
-        split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
-        # Adaptation draws its pokes from the first `pool_passes_n` passes.
-        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
-        sections = {experiment.stage for experiment in self.entries if experiment.settings}
-        sections |= {section for experiment in self.entries for section in experiment.reads}
-        places: dict[str, tuple[Set[str], Set[str]]]
-        places = {WHOLE: ({*(self.model_extra or ())}, sections), "split": (self.split.model_fields_set, split_keys)}
-        if self.simulate is not None:
-            places["simulate.protocols"] = ({*self.simulate.protocols}, self.protocols)
-        return places
+    def named_file(self, experiment: Experiment) -> str:
+        """Return the file that the experiment's section names, or `params.yaml`, on which its stage depends anyway."""
+        return str((self.model_extra or {})[experiment.stage].get(experiment.file) or PARAMS)
 
     @property
     def described(self) -> str:
@@ -162,67 +106,60 @@ class Scene(Strict, extra="allow"):
     def runs(self, unit: str) -> bool:
         """Return whether the scene runs a stage (`drift`), or a stage for one protocol (`simulate-wear`)."""
         stage, _, part = unit.partition("-")
-        if stage in {experiment.stage for experiment in EXPERIMENTS.values() if experiment.kind != "report"}:
-            return stage in {experiment.stage for experiment in self.entries}
+        if stage in {one.stage for one in EXPERIMENTS.values() if one.kind != "report"}:
+            return stage in {one.stage for one in self.entries}
         return not part or self.simulate is None or part in self.protocols
 
     @model_validator(mode="after")
-    def _check_sections(self) -> "Scene":
+    def _check_source(self) -> "Scene":
         if self.simulate is not None and self.source == "recorded":
             raise ValueError("a recorded scene must not have a section simulate")
         if self.simulate is None and self.source == "simulated" and self.boards is None:
             raise ValueError("a simulated scene must have a section simulate, or key boards with the emulated boards")
-        for experiment in self.entries:
-            if missing := set(experiment.needs) - set(self.experiments):
-                raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
-        lacking = [
-            f"{place} lacks {', '.join(sorted(absent))}"
-            for place, (have, want) in self._settings_by_place.items()
-            if (absent := want - have)
-        ]
-        if lacking:
-            raise ValueError(f"a scene must have the settings that its experiments need; {'; '.join(lacking)}")
+        if self.simulate is None and (refused := sorted(one.name for one in self.entries if not one.recorded)):
+            raise ValueError(f"only a simulated scene can run experiments {', '.join(refused)}")
         return self
 
     @model_validator(mode="after")
-    def _check_source(self) -> "Scene":
-        if not self.with_folds and not any(experiment.alone for experiment in self.entries):
-            sufficient = sorted(
-                experiment.name
-                for experiment in EXPERIMENTS.values()
-                if experiment.folds is not None or experiment.alone
-            )
+    def _check_experiments(self) -> "Scene":
+        for one in self.entries:
+            if missing := set(one.needs) - set(self.experiments):
+                raise ValueError(f"experiment {one.name} needs {', '.join(sorted(missing))} in the same scene")
+        if not any(_suffices(one) for one in self.entries):
+            sufficient = sorted(one.name for one in EXPERIMENTS.values() if _suffices(one))
             raise ValueError(f"experiments must include at least one of {', '.join(sufficient)}")
-        only_simulated = sorted(experiment.name for experiment in self.entries if not experiment.recorded)
-        if self.simulate is None and only_simulated:
-            raise ValueError(f"only a simulated scene can run experiments {', '.join(only_simulated)}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_sections(self) -> "Scene":
+        split = {key for one in self.entries for key in one.folds or ()}
+        # Adaptation draws its pokes from the first `pool_passes_n` passes.
+        split |= {"pool_passes_n"} if "adapt" in self.experiments else set()
+        sections = {one.stage for one in self.entries if one.settings}
+        sections |= {name for one in self.entries for name in one.reads}
+        lacking = {"the scene": sections - {*(self.model_extra or ())}, "split": split - self.split.model_fields_set}
+        if self.simulate is not None:
+            lacking["simulate.protocols"] = self.protocols - {*self.simulate.protocols}
+        if named := [f"{place} lacks {', '.join(sorted(names))}" for place, names in lacking.items() if names]:
+            raise ValueError(f"a scene must have the settings that its experiments need; {'; '.join(named)}")
         return self
 
 
+def _suffices(experiment: Experiment) -> bool:
+    """Return whether a scene may consist of this experiment alone."""
+    return experiment.folds is not None or experiment.without_contact
+
+
+SHARED_ROWS: dict[str, type[Schedule]] = {"recipes": Recipe, "adaptations": AdaptationRecipe}
+
+
 class Shared(Strict):
-    """Content of `params.yaml`: settings that scenes share, in named rows."""
+    """Content of `params.yaml`: settings that scenes share; recipes are rows without `steps_n`, which scenes set."""
 
     lost_fraction_max: Annotated[float, Field(ge=0, le=1)]
     faults: FaultPolicy
-    recipes: dict[Name, SharedRow]
-    adaptations: dict[Name, SharedRow]
-
-
-class Plan(Strict):
-    """Content of `pipeline/plan.yaml`, which states what `dvc repro` runs.
-
-    - scenes: the experiments of each planned scene.
-    - captures: the recorded captures of each scene.
-    - held_out: the experiments of each scene for which folds are drawn.
-    - models: the stages of each scene that write models.
-    - stages: the items (scenes, captures or folders) for which each stage runs.
-    """
-
-    scenes: dict[str, tuple[str, ...]]
-    captures: dict[str, tuple[str, ...]]
-    held_out: dict[str, tuple[str, ...]]
-    models: dict[str, tuple[str, ...]]
-    stages: dict[str, Any]
+    recipes: dict[Name, dict[str, Any]]
+    adaptations: dict[Name, dict[str, Any]]
 
 
 def read_scene(root: Path, name: str) -> Scene:
@@ -234,9 +171,7 @@ def read_scene(root: Path, name: str) -> Scene:
 def check_scene(settings: Settings) -> Scene:
     """Check a scene and its sections; each section is parsed by the settings model of the stage that uses it."""
     scene = parse_scene(settings.of_scene, settings.where)
-    for stage in dict.fromkeys(
-        ["split", *(experiment.stage for experiment in scene.entries if experiment.kind != "report")]
-    ):
+    for stage in dict.fromkeys(["split", *(one.stage for one in scene.entries if one.kind != "report")]):
         if model := section_of(getattr(module_of(stage), stage)):
             settings.section(model, stage)
     if scene.simulate is not None:
@@ -247,10 +182,7 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and whether the scene has the sections of settings that they need.
-
-    The sections are not parsed.
-    """
+    """Check a scene's experiments, and that the scene has the sections that they need, which are not parsed."""
     named = content.get("experiments")
     for new, olds in REPLACED.items():
         if old := [name for name in olds if name in content or (isinstance(named, list) and name in named)]:
@@ -275,12 +207,22 @@ def read_shared(path: Path) -> Shared:
         for name, row in getattr(shared, section).items():
             where = f"{path}: {section}.{name}"
             if "steps_n" in row:
-                raise ParamsError(
-                    f"{where}: remove steps_n from this row. Each scene sets steps_n in the section that names the row."
-                )
+                remedy = "Each scene sets steps_n in the section that names the row."
+                raise ParamsError(f"{where}: remove steps_n from this row. {remedy}")
             parse(model, row | {"steps_n": 1}, where)
     return shared
 
 
-def read_plan(path: Path) -> Plan:
-    return parse(Plan, read_yaml(path), str(path))
+def scene_names(root: Path) -> list[str]:
+    if not (root / SCENES).is_dir():
+        raise ParamsError(f"{root / SCENES}: folder not found. Run the command in the folder of the checkout.")
+    return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
+
+
+def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/add-a-scene.md.") -> Path:
+    """Return the file of a scene; raise `ParamsError` if there is none."""
+    known = scene_names(root)
+    if name not in known:
+        guess = did_you_mean(name, known)
+        raise ParamsError(f"no scene {name}.{guess} The scenes are: {', '.join(known)}. {remedy}")
+    return root / SCENES / f"{name}.yaml"

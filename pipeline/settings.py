@@ -1,8 +1,7 @@
 """Settings of a scene: they come from the scene's file, from `params.yaml`, and from the library's nominal skin.
 
-Each file is read once. In `dvc.yaml`, the `params` of a stage must contain all settings on which its results depend.
-tests/test_settings.py checks this for the section of the stage and for the sections to which it refers. It does not
-check which parts of section `simulate` and of the nominal skin a stage uses.
+In `dvc.yaml`, the `params` of a stage contain the settings on which its results depend, except for the boards, skins
+and physics of section `simulate`: stage `physics` writes these to a file, on which the stages depend that use them.
 """
 
 import inspect
@@ -32,26 +31,19 @@ class Seeded(Strict):
 
 
 class SectionWithRows(Strict):
-    """Base class of sections that refer to shared settings by name.
-
-    `params.yaml` contains settings that several scenes share, in named rows, such as training recipes. A section of a
-    scene's file contains only the name of a row.
-    """
+    """Base class of sections that refer to rows of `params.yaml` by name, such as training recipes."""
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
-        """Replace the names of shared rows in a section by the content of these rows.
-
-        This method is called before the section is parsed.
-        """
+        """Replace the names of rows by their content, before the section is parsed."""
         raise NotImplementedError
 
 
 class Training(SectionWithRows):
     """Training recipes by name; for each recipe, one network is trained on every fold with each of `seeds_n` seeds.
 
-    Recipe `paper` is the headline recipe. In the scene's file, the section states `recipe` (the name of a recipe in
-    `params.yaml`), `steps_n` and `variants`. A variant lists only the values that differ from the headline recipe.
+    In the scene's file, the section states `recipe` (a recipe, or the name of one in `params.yaml`), `steps_n` and
+    `variants`, which list only the values that differ from this recipe.
     """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
@@ -72,11 +64,10 @@ class SectionWithTraining(SectionWithRows):
 
 
 class Adaptations(SectionWithRows):
-    """Settings of adaptations by name.
+    """Adaptations by name, which continue the training with `pokes_n` unlabelled indentations of a held-out skin.
 
-    An adaptation continues the training of networks with `pokes_n` unlabelled indentations of a held-out skin. In the
-    scene's file, the section states `adaptation` (the name of a row in `params.yaml`), `base` (the recipe of section
-    train_triplet whose networks are adapted), `steps_n` and `variants`.
+    In the scene's file, the section states `adaptation` (the name of a row in `params.yaml`), `base` (the recipe of
+    section train_triplet whose networks are adapted), `steps_n` and `variants`.
     """
 
     pokes_n: Count
@@ -124,10 +115,7 @@ class Settings:
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
-        """Parse a section of the scene's file.
-
-        A section can name rows of `params.yaml`, for example a recipe. The content of these rows is inserted first.
-        """
+        """Parse a section of the scene's file, after the content of the rows of `params.yaml` that it names."""
         if (model, name) not in self.parsed:
             content, where = self[name], f"{self.where}: {name}"
             if issubclass(model, SectionWithRows):
@@ -142,13 +130,13 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Return a row of `params.yaml` to which a section of a scene refers.
+        """Remove `key` from a section, and return the row of `params.yaml` that its value names, or is.
 
-        The section refers to the row by a key whose value is the name of the row. This key is removed from the section.
         `shared` is the section of `params.yaml` that contains the row.
-        If the key or the row is missing, raises `ParamsError`, whose message names `where` and the key.
         """
         name, rows = take(section, key, where), self.shared[shared]
+        if isinstance(name, dict):
+            return dict(name)
         if not isinstance(name, str) or name not in rows:
             rule = f"one of {', '.join(sorted(rows))} (section {shared} of {PARAMS})"
             raise ParamsError(
@@ -162,11 +150,7 @@ class Settings:
         return parse(Seeded, {"seed": self["seed"]}, self.where).seed
 
     def captures_in(self, indentations: Path) -> list[str]:
-        """Return the names of the captures in a folder of readings.
-
-        For a recorded scene, the names come from the registry rather than from the folder. A file of a capture that has
-        been removed from the scene is therefore not read.
-        """
+        """Return the names of the captures in a folder of readings; files of removed captures are left out."""
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
 
 
@@ -199,11 +183,9 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace the keys `steps_n` and `variants` of a section by the key `recipes`.
+    """Replace the keys `steps_n` and `variants` of a section by `recipes`: the headline recipe and each variant of it.
 
-    `recipes` contains the headline recipe and each of its variants, by name. `shared` is the row of `params.yaml` that
-    the section names. This row, together with `steps_n`, is the headline recipe. A variant is the headline recipe with
-    the changes that the section lists.
+    The headline recipe is the row `shared` with `steps_n`.
     """
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}

@@ -1,7 +1,7 @@
 """Scenes for tests, as dictionaries, and their settings as a stage reads them."""
 
-from pipeline.catalogue import EXPERIMENTS
-from pipeline.scenes import Scene, check_scene, stages
+from pipeline.catalogue import EXPERIMENTS, stages
+from pipeline.scenes import Scene, check_scene
 from pipeline.settings import Settings
 from tests.recordings.headers import DEFAULT_POLICY
 

@@ -23,7 +23,7 @@ from reskin import config
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, ReskinError
 from reskin.recordings import preparing, probe
-from reskin.recordings.header import NAME_RULE, Clock, write_capture
+from reskin.recordings.header import Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
 from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
@@ -92,8 +92,9 @@ def test_added_recording_is_tracked_by_dvc_and_is_in_the_registry_and_the_plan(r
     assert header.capture == "board1_skin1_readings"
     assert (root / "data/raw/small/board1_skin1_readings.dvc").exists()
     assert read_registry(root).captures["small"]["board1_skin1_readings"].board == "board1"
+    assert plan.check(root).scenes == {}  # a recording does not put its scene into the plan
+    plan.use(root, ["small"])
     params = plan.check(root)
-    assert list(params.scenes) == ["small"]
     assert list(params.stages["ingest"]) == ["small-board1_skin1_readings"]
     add.remove(root, "small", "board1_skin1_readings")
     assert plan.check(root).scenes == {}
@@ -163,8 +164,9 @@ def test_recording_that_was_added_before_is_refused_unless_copies_are_allowed(ro
     assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "Nothing has to be added")
     assert_refused(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
     assert_refused(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the same readings as")
+    plan.use(root, ["small"])
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
-    assert len(plan.check(root).stages["ingest"]) == 2
+    assert len(plan.check(root).stages["ingest"]) == 2  # the plan of a planned scene follows its captures
 
 
 def test_copy_of_a_recording_is_recognised_although_its_numbers_are_formatted_differently(root, lab_file, tmp_path):
@@ -269,7 +271,9 @@ def test_invalid_name_is_an_error(root, lab_file, tmp_path, name):
 def test_unknown_scene_is_an_error(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
     assert_refused(
-        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. Did you mean small?.* --like"
+        root,
+        lambda: add.add(root, "smal", prepared, allow_copy=False),
+        "no scene smal. Did you mean small?.* reskin new smal",
     )
 
 
@@ -278,7 +282,7 @@ def test_recording_cannot_be_added_to_a_simulated_scene(root, lab_file):
     assert_refused(
         root,
         lambda: add.add(root, "ci", prepared, allow_copy=False),
-        "scene ci is simulated, but .* is recorded.* --scene NEW --like ini",
+        "scene ci is simulated, but .* is recorded.* reskin new NEW",
     )
 
 
@@ -318,7 +322,7 @@ def test_recording_of_an_emulated_board_can_be_added_to_a_scene_for_emulated_boa
     prepared = preparing.native(folder, labels(), None, ())
     header = add.add(root, "emulated", prepared, allow_copy=False)
     assert header.source == read_scene(root, "emulated").source == "simulated"
-    planned = config.read_yaml(root / PLAN)
+    planned = plan.plan_of(root, ["emulated"])
     assert planned["stages"]["ingest"] == {"emulated-run1": {"scene": "emulated", "capture": "run1"}}
     assert planned["stages"]["simulate"] == {}
 
@@ -415,13 +419,13 @@ def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_reskin_add_prints_that_it_has_added_the_scene_to_the_plan(root_with_code, lab_file, monkeypatch):
+def test_reskin_add_prints_the_command_that_runs_the_scene(root_with_code, lab_file, monkeypatch):
     monkeypatch.chdir(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root_with_code, "reskin", *arguments)
-    assert "next: dvc repro report@small" in done.stdout
-    assert "added scene small to pipeline/plan.yaml" in done.stdout
+    assert "next: reskin scenes use small && dvc repro" in done.stdout
     assert "dvc config" not in done.stdout + done.stderr
+    plan.use(root_with_code, ["small"])
     assert "is up to date; scenes: small" in output_of(["scenes", "check"])
     taken = output_of([*arguments, "--layout", "table"])
     assert "the scene already has a capture with the name b_s_readings" in taken
@@ -429,24 +433,6 @@ def test_reskin_add_prints_that_it_has_added_the_scene_to_the_plan(root_with_cod
     again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
     assert "switched" not in again
-
-
-def test_option_like_copies_a_scene_and_leaves_no_copy_if_adding_fails(root_with_code, lab_file, monkeypatch):
-    monkeypatch.chdir(root_with_code)
-    before = contents(root_with_code)
-    arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
-    assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
-    invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
-    assert f"--scene: a name must be {NAME_RULE}" in invalid
-    assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
-    assert contents(root_with_code) == before
-    run(root_with_code, "reskin", *arguments, "small")
-    text = (root_with_code / SCENES / "mine.yaml").read_text()
-    assert YAML(typ="safe").load(text) == recorded_scene()
-    assert read_registry(root_with_code).captures.keys() == {"mine"}
-    again = output_of([*arguments, "small", "--name", "again"])
-    assert "scene mine exists already" in again
-    assert (root_with_code / SCENES / "mine.yaml").read_text() == text
 
 
 def test_recording_without_contact_is_an_error_if_no_experiment_of_the_scene_uses_it(root, tmp_path):
@@ -470,7 +456,6 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
     assert "describe your boards in this file" in created
     scene = read_scene(root, "mine")
     assert scene.experiments == ("transfer", "lobo", "triplet", "adapt", "audit", "compare", "new_board")
-    assert scene.unused == []
     assert read_settings("mine", root).section(NewBoard, "new_board").model is None
     layout = read_settings("mine", root).section(Compare, "compare").layout
     assert layout == paper_layout().model_copy(update={"name": "mine"})

@@ -22,8 +22,8 @@ from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
 PAGE = (ROOT / "docs/add-an-experiment.md").read_text(encoding="utf-8")
-MODULE, EXPERIMENT, STAGE = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
-FILES = {"repeat.py": MODULE, "repeat.yaml": EXPERIMENT}
+MODULE, ENTRY, STAGE = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
+CATALOGUE = "pipeline/catalogue.py"
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +123,11 @@ def insert_before(file: Path, line: str, text: str) -> str:
 
 def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
-    files = {f"pipeline/experiments/{name}": text for name, text in FILES.items()} | {
+    files = {
+        "pipeline/experiments/repeat.py": MODULE,
+        CATALOGUE: insert_before(root / CATALOGUE, '    _analysis("sensitivity"', ENTRY),
         FLOW: insert_before(root / FLOW, "  report: #", f"{STAGE}\n"),
-        scene: insert_before(root / scene, "single_random,", "repeat, "),
+        scene: insert_before(root / scene, "- single_random", "- repeat\n"),
     }
     with edited_files(root, files):
         run(root, "reskin", "scenes", "use", "ci")
@@ -138,7 +140,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
 
 def test_edit_of_a_caption_reruns_the_stages_that_show_it_and_edits_of_comments_rerun_no_stage(root, before):
     # Both edits are made at once, because each call of `state` takes seconds.
-    captions, io = "pipeline/experiments/shear.yaml", "reskin/io.py"
+    captions, io = "pipeline/report/page.yaml", "reskin/io.py"
     edits = {
         captions: (root / captions).read_text().replace("title: ", "title: More ", 1),
         io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1),

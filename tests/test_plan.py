@@ -8,8 +8,8 @@ from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.catalogue import ANALYSES
 from pipeline.manage.new import SHIPPED, scene_text
 from pipeline.manage.registry import Entry, Registry
-from pipeline.plan import make_plan
-from pipeline.scenes import Plan, Scene, parse_scene
+from pipeline.plan import Plan, make_plan
+from pipeline.scenes import Scene, parse_scene, scene_file
 from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError
@@ -161,7 +161,7 @@ def test_unknown_scene_is_an_error(tmp_path):
     with pytest.raises(ParamsError, match="no scene three. The scenes are: one, two"):
         plan.use(checkout(tmp_path), ["three"])
     with pytest.raises(ParamsError, match="no scene tow. Did you mean two"):
-        plan.scene_file(tmp_path, "tow")
+        scene_file(tmp_path, "tow")
 
 
 def simulated_checkout(tmp_path, **changes):

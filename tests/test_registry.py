@@ -5,24 +5,26 @@ from pipeline.manage.registry import (
     Entry,
     Registry,
     read_registry,
-    with_capture,
+    with_entry,
     without_capture,
     write_registry,
 )
 from reskin.errors import CaptureError
-from reskin.recordings.header import Header
-from tests.recordings.headers import make_header
 from tests.repositories import commit, git
 
 EMPTY = Registry(captures={})
 
 
-def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: int = 5) -> Header:
-    return make_header(capture=capture, board=board, skin=skin, chips_n=chips_n)
+Named = tuple[str, Entry]
 
 
-def register(registry: Registry, entry_header: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
-    return with_capture(registry, "lab", entry_header, (fingerprint, f"stream of {fingerprint}"), allow_copy=allow_copy)
+def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: int = 5) -> Named:
+    return capture, Entry(board=board, skin=skin, layout="lab", chips_n=chips_n, fingerprints=(), copy_of=None)
+
+
+def register(registry: Registry, named: Named, fingerprint: str, *, allow_copy: bool = False) -> Registry:
+    entry = named[1].model_copy(update={"fingerprints": (fingerprint, f"stream of {fingerprint}")})
+    return with_entry(registry, "lab", named[0], entry, allow_copy=allow_copy)
 
 
 ONE = register(EMPTY, header(), "aa")

@@ -4,6 +4,7 @@ Then, a changed setting makes DVC run the right stages again.
 """
 
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import dpath
 import pytest
+from dvc.utils.serialize import modify_yaml
 from ruamel.yaml import YAML
 
 from pipeline import PARAMS, PLAN, SCENES, plan
@@ -148,21 +150,19 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible", "new_board", "accuracy_and_cost"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "drift", "shear", "sleeve"}
-NUMERICAL = {"extremes", "accuracy_and_cost"}  # These experiments compare methods of the simulator.
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
-WITH_BOARDS = {"flexible", "logs", "sleeve", *NUMERICAL}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
-    (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
+    (PARAMS, "recipes.triplet.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", ADAPTING),
-    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, "interference", *NUMERICAL}),
-    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, "logs", "interference", "extremes"}),
-    (SKIN, "terms.ageing.settling=0.2", SIMULATE),
+    (SKIN, "skin.modulus_kPa=300.0", {"physics", *FINGERPRINTED, "interference"}),
+    (SKIN, "chip.gain_sel=4", {"physics", *FINGERPRINTED, "interference"}),
+    (SKIN, "terms.ageing.settling=0.2", {"physics"}),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
     (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag"}),
     (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity"}),
     (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper"}),
-    (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS),
+    (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", {"physics"}),
     (SCENE, "train_single.steps_n=10", {"train_single"}),
     (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "accuracy_and_cost"}),
     (SCENE, "adapt.steps_n=4", {*ADAPTING}),
@@ -188,9 +188,18 @@ def test_edit_of_a_protocol_reruns_only_its_own_simulation(root, stages, before)
         assert {name for name in SIMULATE if before[name] != after[name]} == {f"simulate@ci-{protocol}"}
 
 
-def test_override_changes_the_settings(root):
-    with override_files(root, (SCENE, "train_multi.recipe=slow")):
-        assert read_settings("ci", root).section(Training, "train_multi").recipes["paper"].rate_max == 0.003
+def test_stages_that_simulate_or_read_the_boards_depend_on_the_file_of_stage_physics():
+    readers = {name for name in FLOW if any("data/physics" in dep for dep in FLOW[name].get("do", {}).get("deps", ()))}
+    assert readers == {"simulate", "flexible", "logs", "sleeve", "extremes", "accuracy_and_cost"}
+
+
+def test_section_states_a_recipe_or_the_name_of_a_recipe(root):
+    row = read_shared_files(root)["recipes"]["triplet"]
+    of_scene = read_settings("ci", root).of_scene
+    for recipe in (row, "triplet"):
+        section = {**of_scene["train_multi"], "recipe": recipe}
+        settings = Settings("ci", "ci.yaml", {**of_scene, "train_multi": section}, read_shared_files(root))
+        assert settings.section(Training, "train_multi").recipes["paper"].triplet_weight == row["triplet_weight"]
 
 
 YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / PARAMS, NOMINAL, ROOT / PLAN, *sorted((ROOT / SCENES).glob("*.yaml"))]
@@ -202,6 +211,15 @@ def test_dvc_files_have_no_anchors_or_merge_keys(file):
     tokens = [type(token).__name__ for token in YAML(pure=True).scan(file.read_text())]
     assert {"AnchorToken", "AliasToken"} & set(tokens) == set()
     assert not re.search(r"^\s*<<\s*:|[{,]\s*<<\s*:", file.read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("file", YAML_OF_DVC[1:], ids=lambda file: file.name)
+def test_override_by_dvc_changes_no_other_line(tmp_path, file):
+    copy = tmp_path / file.name
+    shutil.copy(file, copy)
+    with modify_yaml(copy) as content:
+        content["added"] = 1
+    assert copy.read_text() == file.read_text() + "added: 1\n"
 
 
 def test_stage_checks_only_the_sections_that_it_reads(root):

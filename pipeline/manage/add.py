@@ -1,8 +1,8 @@
 """Add a recording to a scene.
 
 The recording is copied to data/raw/<scene>/<capture>/, read completely and checked. It is then tracked with DVC and
-listed in the registry (data/captures.yaml), and its scene is added to the plan. If anything fails or the command is
-stopped, all changes are undone.
+listed in the registry (data/captures.yaml), and in the plan if its scene is planned. If anything fails or the command
+is stopped, all changes are undone.
 """
 
 import hashlib
@@ -14,10 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import PARAMS, PLAN, plan
+from pipeline import PARAMS, PLAN, SCENES
 from pipeline.catalogue import EXPERIMENTS
-from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
-from pipeline.scenes import Scene, read_plan, read_scene, read_shared
+from pipeline.manage.registry import (
+    REGISTRY,
+    Entry,
+    Registry,
+    read_registry,
+    with_entry,
+    without_capture,
+    write_registry,
+)
+from pipeline.plan import read_plan, use
+from pipeline.scenes import Scene, read_scene, read_shared, scene_file
 from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
@@ -36,18 +45,13 @@ COMPARED_N = 3  # the places of a new capture are compared with those of this nu
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
-    """Check and write a prepared recording, track it with DVC, register it, and add its scene to the plan.
-
-    On failure, all of this is undone.
-    """
+    """Check and write a prepared recording, track it with DVC, and register it; on failure, undo all of this."""
     header, files = prepared
-    remedy = (
-        f"To create it, run reskin new {scene} --boards ..., or repeat the command with --like ini, which copies the "
-        "settings of scene ini."
-    )
-    settings = read_scene(root, plan.scene_file(root, scene, remedy=remedy).stem)
+    copy = f"cp {SCENES}/ini.yaml {SCENES}/{scene}.yaml"
+    remedy = f"To create it, run reskin new {scene} --boards ..., or copy a scene: {copy}."
+    settings = read_scene(root, scene_file(root, scene, remedy=remedy).stem)
     if settings.source != header.source:
-        create = "--scene NEW --like ini" if header.source == "recorded" else "reskin new NEW --boards ... --simulated"
+        create = "reskin new NEW --boards ..." + (" --simulated" if header.source == "simulated" else "")
         remedy = f"Choose a scene of the same source, or create one: {create}"
         raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
     if settings.simulate is not None:
@@ -55,7 +59,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         raise ParamsError(f"scene {scene} simulates its own captures, so no recordings can be added to it. {remedy}")
     if settings.boards is not None and header.board not in settings.boards:
         guess, known = did_you_mean(header.board, settings.boards), ", ".join(settings.boards)
-        remedy = f"Correct the name, or add the board to key boards in {plan.scene_file(root, scene)}."
+        remedy = f"Correct the name, or add the board to key boards in {scene_file(root, scene)}."
         raise ParamsError(f"board {header.board} is not a board of scene {scene} ({known}).{guess} {remedy}")
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
@@ -70,10 +74,14 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
                 f"{header.capture}: nothing touches the skin in this recording, and no experiment of scene {scene} "
                 f"uses such recordings. Add the recording to a scene that runs {known}, such as scene hand."
             )
-        after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
+        entry = Entry(
+            board=complete.board, skin=complete.skin, layout=complete.layout, chips_n=complete.chips_n,
+            fingerprints=fingerprints, copy_of=None,
+        )  # fmt: skip
+        after = with_entry(before, scene, complete.capture, entry, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
-        plan.use(root, [*read_plan(root / PLAN).scenes, scene])
+        _update_plan(root, scene, after)
     if "compare" in (settings.model_extra or {}):
         _warn_of_departures(target, read_settings(scene, root), nominal("skin"), shared.faults)
     else:
@@ -93,7 +101,7 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
     if given.board and given.skin:
         return given
     stem = recording.stem
-    boards = config.read_yaml(plan.scene_file(root, scene)).get("boards", ())
+    boards = config.read_yaml(scene_file(root, scene)).get("boards", ())
     starts = [name for name in (given.board, *boards) if name and stem.startswith(f"{name}_")]
     board = max(starts, key=len, default=stem.partition("_")[0])
     skin = stem.removeprefix(f"{board}_").partition("_")[0]
@@ -125,12 +133,18 @@ def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
 def remove(root: Path, scene: str, capture: str) -> None:
     """Remove a capture from the registry and the plan, then delete its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
-    running = read_plan(root / PLAN).scenes
     with io.restoring(root / REGISTRY, root / PLAN):
         write_registry(root, after)
-        plan.use(root, [name for name in running if name != scene or scene in after.captures])
+        _update_plan(root, scene, after)
     _remove_files(root / RAW / scene / capture)
     io.remove(root / INDENTATIONS / scene / f"{capture}.parquet")
+
+
+def _update_plan(root: Path, scene: str, registry: Registry) -> None:
+    """Write the captures of a planned scene to the plan; drop the scene from the plan if it has none left."""
+    planned = list(read_plan(root / PLAN).scenes)
+    if scene in planned:
+        use(root, [name for name in planned if name != scene or scene in registry.captures])
 
 
 def _check_free(target: Path, registered: bool) -> None:

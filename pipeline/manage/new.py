@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline import SCENES
-from pipeline.plan import scene_names
-from pipeline.scenes import Source, read_scene
+from pipeline.scenes import Source, read_scene, scene_names
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.recordings.header import NAME, NAME_RULE
@@ -58,9 +57,8 @@ ABOUT_MODEL = """\
 """
 ONE_BOARD = (
     "two or more boards are needed, because one board cannot be held out and also be trained on. To train on the "
-    "first passes over one board and test on its last passes, run instead: reskin add RECORDING --layout table "
-    "--board B --skin S --scene NAME --like ini. Or use the universal model, which needs no training: see "
-    "docs/live.md, Calibrate the universal model"
+    "first passes over one board and test on its last passes, copy pipeline/scenes/ini.yaml instead. Or use the "
+    "universal model, which needs no training: see docs/live.md, Calibrate the universal model"
 )
 
 

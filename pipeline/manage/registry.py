@@ -9,7 +9,6 @@ from pathlib import Path
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, did_you_mean
-from reskin.recordings.header import Header
 
 REGISTRY = "data/captures.yaml"
 COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`."
@@ -53,15 +52,8 @@ def read_registry(root: Path) -> Registry:
     return registry
 
 
-def with_capture(
-    registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
-) -> Registry:
+def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
     """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another capture."""
-    capture = header.capture
-    entry = Entry(
-        board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
-        fingerprints=fingerprints, copy_of=None,
-    )  # fmt: skip
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None

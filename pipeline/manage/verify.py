@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline import plan
 from pipeline.manage.add import RAW
 from pipeline.manage.registry import REGISTRY
+from pipeline.scenes import scene_file
 from pipeline.stage import say
 from pipeline.tracking import PUBLISH
 from reskin import io
@@ -33,7 +33,7 @@ QUIET = {
 def verify(root: Path, names: Sequence[str], echo: Callable[[str], None]) -> int:
     """Run scenes again, and compare numbers.json with the last commit; return exit status 1 if any value differs."""
     for name in names:
-        plan.scene_file(root, name)
+        scene_file(root, name)
     # Committed numbers are read first, so that a missing file is found before the rerun, which takes hours.
     committed = {name: json.loads(_git(root, "show", f"HEAD:./reports/{name}/numbers.json")) for name in names}
     rerun(root, names)

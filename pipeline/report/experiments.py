@@ -51,5 +51,4 @@ def experiment_figures(numbers: Mapping[str, Any], plot_data: Mapping[str, Any],
 
 def _modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
     """Import the module of each experiment with results in numbers.json, by its key there."""
-    keys = {name: EXPERIMENTS[name].key for name in ANALYSES}
-    return {key: import_module(module_name(name)) for name, key in keys.items() if key in numbers}
+    return {name: import_module(module_name(name)) for name in ANALYSES if name in numbers}

@@ -9,7 +9,6 @@ import pandas as pd
 
 from pipeline.catalogue import EXPERIMENTS
 from pipeline.paper import PLATEAU_POKES_N
-from pipeline.report.table_2 import control_of
 from pipeline.scenes import TABLE_2
 from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
 from pipeline.statistics import (
@@ -43,16 +42,11 @@ PAPERS_SPLITS = (
 # Splits in which the readings of an indentation, or of a pass, are never divided between training and test.
 STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}
 SWEPT = ("multi", "triplet", "adapted")
-SINGLE = {
-    "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
-    "by_time": "single_temporal",
-}  # fmt: skip
-POLICIES = ("initial", "regular", "each")
 BEFORE_TOUCH = ("noload", "scan")  # methods that predict the position from what is known before the contact
 HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
 SEEN_PCT = 25.0  # assumed: if a hovering tip is located with at least this accuracy, the chips sense the tip
-DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
+PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 SHEAR_METRICS = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 
@@ -316,29 +310,17 @@ def join(numbers: Row, provenance: Row) -> dict[str, Any]:
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:
-    """Select a scene's headline scores, nested by experiment: means with units in their names.
+    """Select the means that `dvc metrics` and `dvc exp show` show for a scene.
 
-    The scores contain nothing that differs between repeats of a run, such as times, commit or machine.
+    `new_board` contains the scores of the shipped model on split checkerboard, by number of labels.
     """
-    recorded = numbers["provenance"]["source"] == "recorded"
-    table2, drift = numbers.get("table2", {}) | control_of(numbers), numbers.get("drift", {})
+    new_board = numbers.get("new_board", ())
+    shipped = [row for row in new_board if (row["method"], row["split"]) == ("shipped", "checkerboard")]
     parts: dict[str, Any] = {
-        "table2": {name: _means(row) for name, row in table2.items()},
-        "lobo": {"registered": _means(numbers["lobo"]["registered"])} if recorded and "lobo" in numbers else {},
-        "single_sensor": {
-            name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
-        },
-        "drift_end": {  # the last window of each policy, whose scores are means over networks
-            policy: {name: drift[policy][-1][name] for name in DRIFT_METRICS if name in drift[policy][-1]}
-            for policy in POLICIES
-            if policy in drift
-        },
-        "shear": _means(numbers["shear"], SHEAR_METRICS) if "shear" in numbers else {},
-        "interference": {
-            f"{row['field']}.external_{row['external_uT']:g}_uT": _means(row, ("false_pct", "detected_pct"))
-            for row in numbers.get("interference", {}).get("contacts", ())
-            if row["method"] == "shipped"
-        },
+        "table2": {name: _means(row, PAPER_METRICS) for name, row in numbers.get("table2", {}).items()},
+        "single_sensor": _means(numbers.get("single_sensor", {}), PAPER_METRICS),
+        "shear": _means(numbers.get("shear", {}), SHEAR_METRICS),
+        "new_board": {f"labels_{row['labels_n']}": _means(row, PAPER_METRICS) for row in shipped},
     }
     return {name: part for name, part in parts.items() if part}
 

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import PLAN
-from pipeline.catalogue import EXPERIMENTS
+from pipeline.catalogue import stages
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded, to_markdown
 from pipeline.provenance import (
@@ -35,7 +35,7 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.page import index_page, run_page, scene_page
 from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
-from pipeline.scenes import TABLE_2, Scene, parse_scene, stages
+from pipeline.scenes import TABLE_2, Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -79,7 +79,7 @@ def report(
     io.write_json(reports / "numbers.json", shared)
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
-    plot_data = {EXPERIMENTS[name].key: result["drawn"] for name, result in inputs.analyses.items()}
+    plot_data = {name: result["drawn"] for name, result in inputs.analyses.items()}
     predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
     drawn = draw(numbers, plot_data, predictions)
     io.write_texts(figures, drawn)
@@ -148,13 +148,12 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
 
 def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.DataFrame) -> dict[str, Any]:
     """Compute the content of numbers.json and provenance.json."""
-    analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
     runtime: dict[str, Any] = {"stages": stage_costs(costs)}
     seconds = SECONDS / settings.scene / "accuracy_and_cost.json"
     if "accuracy_and_cost" in scene.experiments and seconds.exists():
         runtime["accuracy_and_cost"] = io.read_json(seconds)
-    experiments = {EXPERIMENTS[name].key: found for name, found in experiment_numbers(inputs.analyses, table).items()}
+    experiments = experiment_numbers(inputs.analyses, table)
     numbers = {
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
@@ -165,9 +164,9 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
         **learning_numbers(table, headline=HEADLINE),
         **inputs.final_model,
         **before_touch_numbers(table),
-        "trainings": count_trainings(inputs.cards, inputs.curves | analyses),
+        "trainings": count_trainings(inputs.cards, inputs.curves | inputs.analyses),
         "described": inputs.described,
-        **{entry.key: experiments[entry.key] for entry in scene.entries if entry.key in experiments},
+        **{entry.name: experiments[entry.name] for entry in scene.entries if entry.name in experiments},
         "runtime": runtime,
     }  # fmt: skip
     if scene.simulate is not None:

@@ -1,4 +1,4 @@
-"""Stage simulate: simulate recordings of skins, and write them as captures (raw files, as a board would send them).
+"""Stages physics and simulate: simulate skins, and write captures (raw files, as a board would send them).
 
 The captures have the same wire format as those of recorded boards, so that all further stages treat both alike.
 """
@@ -16,7 +16,15 @@ from reskin import io
 from reskin.errors import ParamsError
 from reskin.recordings.header import write_capture
 from reskin.simulation.capture import list_captures, simulate_capture, to_files
+from reskin.simulation.defaults import SHARED
 from reskin.simulation.settings import SimulationSettings
+
+
+def physics(settings: Settings, physics: Path) -> None:
+    """Write a scene's boards, and the nominal skin, rig, chip, spreads and terms, on which several stages depend."""
+    simulation_settings(settings)  # raises an error if they are invalid
+    of_scene = {"boards": settings["simulate"]["boards"]}
+    io.write_json(physics, of_scene | {name: settings.shared[name] for name in SHARED})
 
 
 def simulate(settings: Settings, protocol: str, raw: Path) -> None:
