@@ -38,7 +38,7 @@ def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
     # The figure on the paper's grid has more elements: five chips, the skin and two entries of the legend. Its axes
     # have two spines fewer.
-    assert draw_grid().count('-patch_') - elsewhere.count('-patch_') == 5 + 1 + 2 - 2
+    assert draw_grid().count("-patch_") - elsewhere.count("-patch_") == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
 
@@ -47,7 +47,7 @@ def test_outline_of_another_board_replaces_that_of_the_papers_board():
     outline = Outline((10.0, 4.0), (30.0, 20.0), ((20.0, 10.0), (25.0, 15.0)))
     text = error_grid(PLACES_MM + 12, PLACES_MM + 12, title="mine", outline=outline)
     # The paper's board has five chips, the other board two.
-    assert draw_grid().count('-patch_') - text.count('-patch_') == 5 - 2
+    assert draw_grid().count("-patch_") - text.count("-patch_") == 5 - 2
 
 
 def test_title_of_the_figure_states_the_place_with_the_largest_error():
