@@ -29,7 +29,7 @@ class Recording(Strict):
     layout: ReaderLayout
     board: str
     skin: str
-    options: dict[str, str] = {}
+    options: dict[str, str] = Field(default_factory=dict)
 
 
 class Source(Strict):
@@ -41,8 +41,8 @@ class Source(Strict):
     licence: str | None
     scene: str | None
     files: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
-    archives: dict[str, str] = {}
-    urls: dict[str, str] = {}
+    archives: dict[str, str] = Field(default_factory=dict)
+    urls: dict[str, str] = Field(default_factory=dict)
     recordings: tuple[Recording, ...] = ()
 
     def __str__(self) -> str:
