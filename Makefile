@@ -12,7 +12,6 @@
 # make time-install   installs the wheel in an empty environment: measures time and size, and opens `reskin live`
 # make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   starts an MLflow server on PostgreSQL; Ctrl-C stops it
 # make teams   tests the workflows of a team, on servers that it starts and stops -> docs/measured/teams.md
-# make cluster-test   runs a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
 # make clean   removes the files made by the targets above, except data and results
 
 PYTHON ?= python3
@@ -33,7 +32,7 @@ export PYTHONDONTWRITEBYTECODE =
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 .PHONY: repro test test-pythons test-processors compiled collected lint ui bench faults time-repro time-install readme constraints licences audit clean
-.PHONY: team-server teams cluster-test
+.PHONY: team-server teams
 .DEFAULT_GOAL := repro
 
 $(STAMP): pyproject.toml constraints.txt
@@ -128,9 +127,6 @@ team-server: $(VENV)/.team
 
 teams: $(VENV)/.team
 	$(BIN)/python -m tests.benchmarks.teams
-
-cluster-test: $(VENV)/.team
-	$(BIN)/python -m tests.benchmarks.cluster
 
 readme: $(STAMP)
 	$(BIN)/reskin readme
