@@ -17,6 +17,7 @@ import os
 import sqlite3
 import time
 import urllib.request
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -157,8 +158,8 @@ def read_trainings(scene: str) -> Iterator[Run]:
             name=FINAL if final else file.stem,
             kind=MODEL if final else TRAINING,
             key=card["key"],
-            params=params,
-            metrics=scores.reindex(METRICS).dropna().to_dict(),
+            params={name: str(value)[:500] for name, value in params.items()},
+            metrics={name: scores[name] for name in METRICS if name in scores},
             curve=tuple(zip(card["curve_steps"], card["curve"], strict=True)),
             files=(file, file.with_suffix(SUFFIX)),
             seconds=durations_s.get(card["key"]),
@@ -175,7 +176,8 @@ def read_means(scene: str, trainings: list[Run]) -> Iterator[Run]:
     scores = io.read_json(file) if file.exists() else {}
     table2 = scores.pop("table2", {})
     for experiment, values in scores.items():
-        yield _mean(experiment, {"method": experiment}, pd.json_normalize(values).to_dict("records")[0])
+        flat = pd.json_normalize(values).iloc[0]  # names such as each.accuracy_pct
+        yield _mean(experiment, {"method": experiment}, {str(name): float(value) for name, value in flat.items()})
     for method, metrics in reversed(table2.items()):  # MLflow lists the newest run first
         # A control has its own recipe instead of its own method.
         kinds = ((method, HEADLINE), ("adapted", method))
@@ -218,6 +220,7 @@ def _client(uri: str) -> Any:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     for name, level in {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}.items():
         logging.getLogger(name).setLevel(level)
+    warnings.filterwarnings("ignore", ".*input example")
     import mlflow
 
     mlflow.set_tracking_uri(uri)
@@ -238,7 +241,7 @@ def _experiment(client: Any, name: str) -> str:
     columns = [*scores, "params.`method`", "params.`recipe`", "params.`fold`", "attributes.`Duration`"]
     state = {"orderByKey": "tags.`kind`", "orderByAsc": True, "selectedColumns": columns}
     state["columnOrder"] = [name_column, *columns]
-    state["columnWidths"] = {name_column: 190} | dict.fromkeys(scores, 105)  # px
+    state["columnWidths"] = {name_column: 170} | dict.fromkeys(scores, 95)  # px
     made_ms = found.creation_time or 0
     view = {"name": "Scores", "createdAt": made_ms, "updatedAt": made_ms, "state": json.dumps(state)}
     tag, value = f"mlflow.sharedViewState.{VIEW}", json.dumps(view)
@@ -276,7 +279,7 @@ def _write(client: Any, experiment_id: str, run: Run, known: Any) -> tuple[str, 
     metrics = [Metric(name, float(f"{value:.6g}"), end_ms, 0) for name, value in run.metrics.items()]
     metrics += [Metric("train_s", run.seconds, end_ms, 0)] if run.seconds is not None else []
     metrics += [Metric("loss", loss, end_ms, step) for step, loss in run.curve]
-    client.log_batch(run_id, metrics, [Param(name, str(value)[:500]) for name, value in run.params.items()])
+    client.log_batch(run_id, metrics, [Param(name, str(value)) for name, value in run.params.items()])
     for file in run.files:
         client.log_artifact(run_id, str(file))
     client.set_terminated(run_id, end_time=end_ms)
