@@ -16,7 +16,6 @@ from reskin.code import file_of, files_of
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
 STAGES = {name: stage.get("do", stage) for name, stage in FLOW.items()}
-MANUAL = "pipeline.experiments.manual"
 OTHERS = sorted(STAGES.keys() - {"code"})
 
 
@@ -52,6 +51,10 @@ def test_report_depends_on_every_data_file_of_the_report_and_of_the_experiments(
     pages = ROOT / "pipeline/report/pages"
     assert {file for file in data if file.suffix in code.DATA and file.parent != pages} <= read
     assert "pipeline/report/pages" in STAGES["report"]["deps"]
+
+
+def test_digests_of_an_experiment_do_not_contain_the_report():
+    assert not any(name.startswith("pipeline.report") for name in digests_of("manual"))
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))
