@@ -17,12 +17,16 @@ import os
 import sqlite3
 import time
 import urllib.request
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
 
 from pipeline.provenance import COSTS, home, is_experiment, read_costs
 from pipeline.scenes import TABLE_2
@@ -34,8 +38,6 @@ from reskin.models.recipe import HEADLINE
 from reskin.models.trained import SUFFIX
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from reskin.models.trained import Network
 
 STAGES = ("train_single", "train_multi", "train_triplet", "adapt", "report")  # stages after which runs are written
@@ -47,6 +49,7 @@ ANSWER_S = 2.0  # longest wait for a server or for a locked SQLite store
 LIMIT_S, LIMIT_PER_RUN_S = 30.0, 1.0  # time limit for writing a scene; a local store takes 0.1 s per run
 CHAMPION = "champion"
 OUTPUTS = ["x_mm", "y_mm", "force_N"]
+METHODS = {experiment: method for method, experiment in TABLE_2.items()}
 FINAL = "final"  # name of the final model and of its folder
 VIEW = "scores"  # name of the saved view of the table of runs
 # Kinds of runs. The view sorts by this tag, so that mean scores come first, and hundreds of training runs last.
@@ -102,6 +105,8 @@ def publish(scene: str, *, reported: bool = True) -> str:
     """
     name = f"{scene} (dvc exp)" if is_experiment() else scene
     uri = os.environ.get(SERVER) or f"{SQLITE}{(home() / 'mlflow.db').resolve()}"
+    if not Path(f"data/scores/{scene}").exists():
+        return f"{name}: there are no results to write to MLflow. To compute them: dvc repro"
     try:
         _probe(uri)
         client = _client(uri)
@@ -141,19 +146,20 @@ def read_trainings(scene: str) -> Iterator[Run]:
         card = io.read_json(file)
         if "recipe_name" not in card:
             continue
-        names = {experiment: method for method, experiment in TABLE_2.items()}
         final = card["question"] == FINAL
-        params = {"method": names.get(card["question"], card["question"]), "recipe": card["recipe_name"]}
+        params = {"method": METHODS.get(card["question"], card["question"]), "recipe": card["recipe_name"]}
         params |= {name: card[name] for name in ("fold", "seed_i", "seed")} | card["recipe"]
         params |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
         params |= {"train_rows_n": card["train_rows_n"], "train_skins_n": len(card["train_skins"])}
         params |= {name: ", ".join(card[name]) for name in ("train_boards", "test_boards", "test_skins")}
+        # The final model cannot be tested. Its scores are those of networks that were trained without the tested board.
+        scores = pd.DataFrame(card["held_out"]).mean(axis=1) if final else pd.Series(card["scores"]["all"])
         yield Run(
             name=FINAL if final else file.stem,
             kind=MODEL if final else TRAINING,
             key=card["key"],
-            params=params,
-            metrics=_mean_over_boards(card["held_out"]) if final else _known(card["scores"]["all"]),
+            params={name: str(value)[:500] for name, value in params.items()},
+            metrics={name: scores[name] for name in METRICS if name in scores},
             curve=tuple(zip(card["curve_steps"], card["curve"], strict=True)),
             files=(file, file.with_suffix(SUFFIX)),
             seconds=durations_s.get(card["key"]),
@@ -170,7 +176,8 @@ def read_means(scene: str, trainings: list[Run]) -> Iterator[Run]:
     scores = io.read_json(file) if file.exists() else {}
     table2 = scores.pop("table2", {})
     for experiment, values in scores.items():
-        yield _mean(experiment, {"method": experiment}, dict(_flatten(values)))
+        flat = pd.json_normalize(values).iloc[0]  # names such as each.accuracy_pct
+        yield _mean(experiment, {"method": experiment}, {str(name): float(value) for name, value in flat.items()})
     for method, metrics in reversed(table2.items()):  # MLflow lists the newest run first
         # A control has its own recipe instead of its own method.
         kinds = ((method, HEADLINE), ("adapted", method))
@@ -181,25 +188,6 @@ def read_means(scene: str, trainings: list[Run]) -> Iterator[Run]:
 
 def _mean(name: str, params: Mapping[str, Any], metrics: Mapping[str, float]) -> Run:
     return Run(name, MEAN, _digest([name, dict(params), dict(metrics)]), params, metrics)
-
-
-def _known(scores: Mapping[str, float]) -> dict[str, float]:
-    return {name: scores[name] for name in METRICS if name in scores}
-
-
-def _mean_over_boards(held_out: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Average the scores of networks that were trained like the final model, without the tested board."""
-    boards = list(held_out.values())
-    known = [name for name in METRICS if boards and all(name in scores for scores in boards)]
-    return {name: sum(scores[name] for scores in boards) / len(boards) for name in known}
-
-
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float):
-            yield f"{prefix}{name}", value
 
 
 def _digest(value: Any) -> str:
@@ -232,6 +220,7 @@ def _client(uri: str) -> Any:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     for name, level in {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}.items():
         logging.getLogger(name).setLevel(level)
+    warnings.filterwarnings("ignore", ".*input example")
     import mlflow
 
     mlflow.set_tracking_uri(uri)
@@ -252,7 +241,7 @@ def _experiment(client: Any, name: str) -> str:
     columns = [*scores, "params.`method`", "params.`recipe`", "params.`fold`", "attributes.`Duration`"]
     state = {"orderByKey": "tags.`kind`", "orderByAsc": True, "selectedColumns": columns}
     state["columnOrder"] = [name_column, *columns]
-    state["columnWidths"] = {name_column: 190} | dict.fromkeys(scores, 105)  # px
+    state["columnWidths"] = {name_column: 170} | dict.fromkeys(scores, 95)  # px
     made_ms = found.creation_time or 0
     view = {"name": "Scores", "createdAt": made_ms, "updatedAt": made_ms, "state": json.dumps(state)}
     tag, value = f"mlflow.sharedViewState.{VIEW}", json.dumps(view)
@@ -290,7 +279,7 @@ def _write(client: Any, experiment_id: str, run: Run, known: Any) -> tuple[str, 
     metrics = [Metric(name, float(f"{value:.6g}"), end_ms, 0) for name, value in run.metrics.items()]
     metrics += [Metric("train_s", run.seconds, end_ms, 0)] if run.seconds is not None else []
     metrics += [Metric("loss", loss, end_ms, step) for step, loss in run.curve]
-    client.log_batch(run_id, metrics, [Param(name, str(value)[:500]) for name, value in run.params.items()])
+    client.log_batch(run_id, metrics, [Param(name, str(value)) for name, value in run.params.items()])
     for file in run.files:
         client.log_artifact(run_id, str(file))
     client.set_terminated(run_id, end_time=end_ms)
@@ -306,15 +295,12 @@ class FinalModel:
     def __init__(self, network: "Network") -> None:
         self.network = network
 
-    def predict(self, model_input: "pd.DataFrame", params: Mapping[str, Any] | None = None) -> "pd.DataFrame":
+    def predict(self, model_input: pd.DataFrame, params: Mapping[str, Any] | None = None) -> pd.DataFrame:
         """Predict x_mm, y_mm and force_N.
 
         model_input: one row per reading, with the change of each channel's field since the no-load reading in uT, in
         columns Bx0, By0, Bz0, Bx1, ... params: not used.
         """
-        import numpy as np
-        import pandas as pd
-
         return pd.DataFrame(self.network(np.asarray(model_input, np.float32)), columns=OUTPUTS)
 
 

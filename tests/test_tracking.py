@@ -37,6 +37,7 @@ def _checkout(monkeypatch, tmp_path, empty_store):
     held_out = {"b0": {"accuracy_pct": 60.0}, "b1": {"accuracy_pct": 70.0}}
     write_card("final", "final", question="final", held_out=held_out)
     write_means(50.0)
+    Path("data/scores/ci").mkdir(parents=True)
     cost = {"trainings_s": {"lobo.paper.b0": 4.5}}
     io.write_json(Path(".reskin/costs/ci/train_multi.json"), cost)
 

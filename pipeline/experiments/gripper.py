@@ -251,7 +251,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
                 runs_n = len(row["off_pct"])
                 x = [i + 0.5 * (j + 0.5) / runs_n - 0.25 for j in range(runs_n)]
                 axes.plot(x, row["off_pct"], "o", color=COLOURS[1 + (row["press"] != "none")], markersize=3)
-            axes.set(title=f"{aim_N:g} N", ylabel="mean force minus aim / %")
+            axes.set(title=f"{aim_N:g} N", ylabel="force minus aim / %")
         labels = [f"{row['feedback']}\n{PRESSES[row['press']]}" for row in rows]
-        axes.set_xticks(range(len(rows)), labels, rotation=45)
+        axes.set_xticks(range(len(rows)), labels)
         return {"gripper.svg": svg(figure)}

@@ -88,7 +88,8 @@ class Page:
         """Place a table of the scene."""
         self.placed.add(name)
         number = NUMBER.fullmatch
-        return self._part(self._macro("table")(name, self.tables[name].astype(str), number))
+        cells = self.tables[name].map(lambda cell: "–" if pd.isna(cell) else str(cell))
+        return self._part(self._macro("table")(name, cells, number))
 
     def folded(self, name: str, title: str) -> str:
         """Place a table of the scene below a line that unfolds it; nothing if the scene has no such table."""

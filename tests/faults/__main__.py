@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from reskin import io
-from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
+from tests.faults import files, kills, together  # noqa: F401 (importing a module adds its faults)
 from tests.faults.harness import CASES, Checkout, Row, copy, line, make_template, not_run, table
 from tests.repositories import git
 from tests.stages.checkout import ROOT
