@@ -103,7 +103,7 @@ def test_name_that_does_not_exist_is_an_error_that_names_the_file(tmp_path, monk
 
 def test_page_of_a_run_has_commit_and_times():
     numbers = all_experiments()
-    html = run_page(numbers, run_tables(numbers, "simulated"), {"time.svg": SVG})
+    html = run_page(numbers, run_tables(numbers), {"time.svg": SVG})
     assert numbers["provenance"]["device"] in html
     assert 'id="time"' in html
 
