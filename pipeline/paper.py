@@ -36,7 +36,7 @@ SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_fxy_N2": (0.0011, 0.0002),
     "mse_fz_N2": (0.003, 0.001),
 }
-MANUAL_POKES_N = 325  # section 5, manual indentations; the paper gives no deviations
+MANUAL_POKES_N = 325  # section 5, manual indentations
 MANUAL: dict[str, dict[str, float]] = {  # section 5, manual indentations; the paper gives no deviations
     "before": {"accuracy_pct": 79.86, "mse_xy_mm2": 0.676, "mse_f_N2": 0.268},
     "after": {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192},

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from hashlib import sha256
 from typing import Any
 
-from cycler import cycler
+from matplotlib import cycler
 
 WIDTH_IN = 4.7
 # Okabe & Ito 2008: colours that colour-blind readers can distinguish; their yellow is omitted, as it is pale on white.

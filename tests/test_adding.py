@@ -177,8 +177,9 @@ def test_copy_of_a_recording_is_recognised_although_its_numbers_are_formatted_di
 
 def test_failed_removal_changes_no_files(root, lab_file):
     add_lab(root, lab_file)
+    plan.use(root, ["small"])
     file = root / PLAN
-    file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
+    file.write_text(file.read_text().replace("  small:\n", "  nowhere: [lobo]\n  small:\n", 1))
     assert_refused(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 
@@ -444,6 +445,7 @@ def test_recording_without_contact_is_an_error_if_no_experiment_of_the_scene_use
 
 def test_stage_split_fails_without_traceback_if_the_scene_has_only_one_board(root_with_code, lab_file):
     add_lab(root_with_code, lab_file)
+    plan.use(root_with_code, ["small"])
     done = run(root_with_code, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0
     assert "experiment lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout

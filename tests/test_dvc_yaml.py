@@ -16,7 +16,6 @@ from reskin.code import file_of, files_of
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
 STAGES = {name: stage.get("do", stage) for name, stage in FLOW.items()}
-MANUAL = "pipeline.experiments.manual"
 OTHERS = sorted(STAGES.keys() - {"code"})
 
 
@@ -49,20 +48,12 @@ def test_digests_contain_the_modules_of_a_stage():
 def test_report_depends_on_every_data_file_of_the_report_and_of_the_experiments():
     data = {file for name in ("report", "experiments") for file in (ROOT / "pipeline" / name).rglob("*.*")}
     read = {file for name in digests_of("report") for file in files_of(name)}
-    assert {file for file in data if file.suffix in code.DATA} <= read
+    pages = ROOT / "pipeline/report/pages"
+    assert {file for file in data if file.suffix in code.DATA and file.parent != pages} <= read
+    assert "pipeline/report/pages" in STAGES["report"]["deps"]
 
 
-def test_edited_caption_reruns_only_the_report(monkeypatch):
-    monkeypatch.setattr("pipeline.stages.code.digest", code.digest)
-    monkeypatch.setattr(code, "normalised", lambda file, content: b"other" if file == "manual.yaml" else b"same")
-    code.digest.cache_clear()
-    other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
-    monkeypatch.setattr(code, "normalised", lambda file, content: b"same")
-    code.digest.cache_clear()
-    same = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
-    code.digest.cache_clear()
-    assert other["manual"] == same["manual"]
-    assert other["report"] != same["report"]
+def test_digests_of_an_experiment_do_not_contain_the_report():
     assert not any(name.startswith("pipeline.report") for name in digests_of("manual"))
 
 

@@ -217,7 +217,8 @@ STAND_IN = """
 import pathlib, sys
 out = pathlib.Path(sys.argv[-1])  # the output of a stage
 out.mkdir(parents=True, exist_ok=True)
-(out / "simulate").touch()  # the digest that stage simulate depends on
+(out / "simulate").touch()  # the digests on which the stages depend
+(out / "physics").touch()
 """
 
 

@@ -4,14 +4,14 @@ The digests of a stage are written to the file data/code/<stage>, on which the s
 edited, the files of the stages that import this module change, and DVC runs these stages again. Comments and docstrings
 are not part of a digest, so edits of them cause no runs.
 
-The modules in `SHOWING` and the YAML files of experiments affect only how results are shown. Therefore, they are
-included only in the files of stages that show results.
+The modules in `SHOWING` affect only how results are shown. Therefore, they are included only in the files of stages
+that show results.
 """
 
 import gc
 from pathlib import Path
 
-from pipeline.catalogue import ANALYSES, EXPERIMENTS_PACKAGE, MODULES, module_name
+from pipeline.catalogue import ANALYSES, MODULES, module_name
 from reskin import io
 from reskin.code import digest, imported
 
@@ -32,8 +32,7 @@ def digests_of(stage: str) -> dict[str, str]:
     names = imported(module_name(stage))
     if PRESENTATION in names:
         return {name: digest(name) for name in imported(module_name(stage), *map(module_name, ANALYSES))}
-    computing = [name for name in names if not name.startswith(SHOWING)]
-    return {name: digest(name, data=not name.startswith(EXPERIMENTS_PACKAGE)) for name in computing}
+    return {name: digest(name) for name in names if not name.startswith(SHOWING)}
 
 
 def write_digests(digests: Path) -> None:

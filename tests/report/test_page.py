@@ -64,9 +64,7 @@ def test_page_of_each_committed_scene_is_whole(scene):
 
 
 def test_page_shows_the_numbers_of_the_scene():
-    numbers = all_experiments() | {
-        "described": {"grid": {"counts": {"captures_n": 2, "indentations_n": 7}, "over_skins": {}}}
-    }
+    numbers = io.read_json(ROOT / "reports/quick/numbers.json")
     numbers["table2"]["adapted"]["accuracy_pct"] = {"mean": 71.64, "n": 6, "ci95": [61.4, 79.3]}
     html = scene_page(numbers, {}, figures_of("*.md"))
     assert "72 [61, 79] %" in html
