@@ -125,7 +125,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
     files = {
         "pipeline/experiments/repeat.py": MODULE,
-        CATALOGUE: insert_before(root / CATALOGUE, '    _analysis("sensitivity"', ENTRY),
+        CATALOGUE: insert_before(root / CATALOGUE, '    _analysis("sensitivity"', f"    {ENTRY.strip()},\n"),
         FLOW: insert_before(root / FLOW, "  report: #", f"{STAGE}\n"),
         scene: insert_before(root / scene, "- single_random", "- repeat\n"),
     }
