@@ -13,8 +13,8 @@ case $word in
 scheduler)
     exec python -m distributed.cli.dask_scheduler --port "${1:-8786}" --no-dashboard --no-jupyter
     ;;
-worker) # imports the package first: it sets variables that libraries read when they load
-    exec python -c "import pipeline.cluster; from distributed.cli.dask_worker import main; main()" \
+worker) # the package is imported first, because it sets variables that libraries read when they are loaded
+    exec python -c "import pipeline; from distributed.cli.dask_worker import main; main()" \
         "$1" --nworkers "${2:-1}" --nthreads 1 --no-dashboard --death-timeout 300
     ;;
 run)

@@ -16,10 +16,8 @@ def main() -> None:
         sys.exit(f"error: {problem}. Try: cd {here}; python -m pipeline")
     try:
         if name == "code":
-            from pipeline.manage.remaining import announce
             from pipeline.stages.code import write_digests
 
-            announce()
             parser = argparse.ArgumentParser(prog="python -m pipeline code", description=write_digests.__doc__)
             parser.add_argument("--digests", type=Path, required=True)
             write_digests(parser.parse_args(sys.argv[2:]).digests)
@@ -29,10 +27,11 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"error: package {error.name} is not installed for {sys.executable}. Try: . .venv/bin/activate")
     if is_stage(name):
-        from pipeline.manage.remaining import announce
+        scene = run(getattr(module_of(name), name), sys.argv[2:])
+        # Imported here and not by a stage, so that changes of the tracking rerun no stage.
+        from pipeline.tracking import after_stage
 
-        announce()
-        run(getattr(module_of(name), name), sys.argv[2:])
+        after_stage(name, scene)
     else:
         from reskin.cli import main as command
 

@@ -5,7 +5,6 @@ commands, so that `reskin --help` starts quickly.
 """
 
 import sys
-from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -83,11 +82,13 @@ def new(
     Each board is held out in turn: networks are trained on the other boards and tested on this one.
     """
     from pipeline.manage import new as creating
+    from pipeline.manage.lock import changing
 
     names = [name.strip() for name in boards.split(",") if name.strip()]
     source: Source = "simulated" if simulated else "recorded"
-    for step in creating.new(ROOT, scene, names, presses_n, passes_n, layout, source)[1]:
-        typer.echo(step)
+    with changing(ROOT):
+        steps = creating.new(ROOT, scene, names, presses_n, passes_n, layout, source)[1]
+    typer.echo("\n".join(steps))
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -163,63 +164,26 @@ def add(
     If one of the recordings cannot be added, none of them is added.
     """
     from pipeline.manage import add as adding
+    from pipeline.manage.lock import changing
+    from pipeline.manage.options import Options
     from pipeline.plan import next_command
-    from reskin.recordings import preparing
+    from reskin.recordings.preparing import CaptureNames, suggesting_layout
 
-    serial, native = {"serial-binary", "serial-text"}, {"capture", "serial-binary", "serial-text"}
-    _check_options(
-        layout,
-        {
-            "--probe": (probe, native), "--mark": (mark, native), "--chips": (chips_n, serial),
-            "--rate-hz": (rate_hz, serial), "--wire": (wire, serial), "--rows-late": (rows_late, {"ini"}),
-            "--force-axis": (force_axis, {"eflesh"}), "--pad": (pad, {"leaphand"}),
-        },
-    )  # fmt: skip
-    _check_number(recordings, {"--name": name, "--skin": skin, "--probe": probe, "--mark": mark or None})
-    marks = preparing.parse_marks(mark or [])
+    options = Options(probe, mark, chips_n, rate_hz, wire, rows_late, force_axis, pad)
+    options.check(layout)
+    for option, value in (("--name", name), ("--skin", skin), ("--probe", probe), ("--mark", mark)):
+        if value is not None and len(recordings) > 1:
+            n = len(recordings)
+            raise ParamsError(f"{option} is for one recording, but there are {n}. Add each with a command of its own.")
     added: list[str] = []
-    with adding.undoing(ROOT, scene, added):
+    with changing(ROOT), adding.undoing(ROOT, scene, added):
         for recording in recordings:
-            names = adding.names_of(ROOT, scene, recording, preparing.CaptureNames(board or "", skin or "", name))
-            with preparing.suggesting_layout(recording, layout):
-                if layout == "capture":
-                    prepared = preparing.native(recording, names, probe, marks)
-                elif layout == "serial-binary" or layout == "serial-text":
-                    default_wire: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-                    dump_options = preparing.Dump(
-                        wire or default_wire, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks
-                    )
-                    prepared = preparing.dump(recording, names, dump_options)
-                else:
-                    options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
-                    options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
-                    options |= {"pad": str(pad)} if layout == "leaphand" and pad is not None else {}
-                    prepared = preparing.foreign(recording, layout, names, options)
-                header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
+            names = adding.names_of(ROOT, scene, recording, CaptureNames(board or "", skin or "", name))
+            with suggesting_layout(recording, layout):
+                header = adding.add(ROOT, scene, options.prepare(recording, layout, names), allow_copy=allow_copy)
             added.append(header.capture)
             typer.echo(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
     typer.echo(f"next: {next_command(ROOT, scene)}")
-
-
-def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None:
-    """Raise `ParamsError` if an option that names or describes one recording is given with several recordings."""
-    given = [option for option, value in options.items() if value is not None]
-    if len(recordings) > 1 and given:
-        raise ParamsError(
-            f"{given[0]} is for one recording, but there are {len(recordings)}. Add each recording with a command of "
-            "its own."
-        )
-
-
-def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
-    """Raise `ParamsError` if an option is given that the layout does not use.
-
-    options: for each option, its value and the layouts that use it.
-    """
-    for option, (value, layouts) in options.items():
-        if value not in (None, []) and layout not in layouts:
-            used = " and ".join(sorted(layouts))
-            raise ParamsError(f"{option} is only for --layout {used}, not {layout}. Omit {option}.")
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -233,7 +197,7 @@ def fetch(
     ] = None,
     origin: Annotated[
         str | None,
-        Option("--from", help="Git mirror or folder from which the files are taken, instead of their public address."),
+        Option("--from", help="Folder, or address of a mirror, from which the files are taken."),
     ] = None,
     scene: Annotated[
         str | None,
@@ -243,11 +207,13 @@ def fetch(
 ) -> None:
     """Fetch public recordings, check that the files are complete and unchanged, and add them to a scene."""
     from pipeline.manage import fetch as fetching
+    from pipeline.manage.lock import changing
 
     def agree(question: str) -> bool:
         return yes or (sys.stdin.isatty() and typer.confirm(question))
 
-    fetching.fetch(ROOT, source, origin, scene, agree=agree, say=typer.echo)
+    with changing(ROOT):
+        fetching.fetch(ROOT, source, origin, scene, agree=agree, say=typer.echo)
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -257,100 +223,39 @@ def remove(
 ) -> None:
     """Remove a recording from a scene, and delete its files from the checkout."""
     from pipeline.manage import add as adding
+    from pipeline.manage.lock import changing
 
-    adding.remove(ROOT, scene, capture)
+    with changing(ROOT):
+        adding.remove(ROOT, scene, capture)
     typer.echo(f"removed {scene}/{capture}; next: dvc repro")
 
 
 @app.command(rich_help_panel=MAINTENANCE)
-def merge() -> None:
-    """Resolve the git conflicts that arise when a branch with other recordings is merged.
-
-    The conflicts are in the files that commands write: data/captures.yaml, pipeline/plan.yaml, dvc.lock and reports.
-    """
-    from pipeline.manage import merge as merging
-
-    typer.echo(merging.merge(ROOT))
-
-
-@app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write to MLflow the training runs and reports that are missing there.
+    """Write to MLflow the training runs, scores and final models that it lacks, and print links to them.
 
-    They are missing, for example, if the MLflow server could not be reached when they were computed.
+    They are missing, for example, if DVC took the results from its cache, or if MLflow could not be reached.
     """
-    from pipeline.scenes import read_scene
-    from pipeline.stages.report import published_results, write_scene
+    from pipeline import tracking
 
     for name in checked_plan().scenes:
-        scene, results = read_scene(ROOT, name), ROOT / "data/results" / name
-        models = {stage: ROOT / "data/models" / name / stage for stage in scene.model_stages}
-        written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
-        missing = [path for path in (*models.values(), *written) if not path.exists()]
-        if missing:
-            path = missing[0].relative_to(ROOT)
-            typer.echo(
-                f"scene {name}: {path} is missing, so nothing is written to MLflow. To compute all results: dvc repro"
-            )
-            continue
-        folders = (
-            *(ROOT / "data" / kind / name for kind in ("indentations", "models", "scores", "results")),
-            ROOT / "reports" / name,
-        )
-        typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))
+        typer.echo(tracking.publish(name))
 
 
 @app.command(rich_help_panel=PIPELINE)
-def compare(
-    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
-    against: Annotated[str, Option(help="Compare with the reports of this git revision or folder.")] = "HEAD",
-) -> None:
-    """Compare the reports in reports/ with the committed reports. The exit status is 1 if any value differs."""
-    from pipeline.manage.compare import compare_scene
-
-    names = [scene] if scene else checked_plan().scenes
-    sys.exit(max((compare_scene(ROOT, name, against, typer.echo) for name in names), default=0))
-
-
-@app.command(rich_help_panel=PIPELINE)
-def summary(
-    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
-) -> None:
-    """Print the main scores, say whether they equal the committed scores, and name pages and commands to go on with."""
-    from pipeline.manage.summary import print_summary
-
-    print_summary(ROOT, [scene] if scene else list(checked_plan().scenes), typer.echo)
-
-
-@app.command(rich_help_panel=PIPELINE)
-def verify_reports(
+def verify(
     names: Annotated[
         list[str] | None,
         Argument(metavar="[SCENE]...", help="Names of scenes. Default: all scenes that `dvc repro` runs."),
     ] = None,
-    against: Annotated[
-        Path | None,
-        Option(
-            help="Folder with reports of scenes that were run again before. If this option is given, the scenes are "
-            "not run, and these reports are compared."
-        ),
-    ] = None,
 ) -> None:
-    """Run scenes again in a fresh clone of the last commit, and compare their reports with the committed reports.
+    """Run scenes again in a fresh clone of the last commit, and compare their numbers with the committed ones.
 
     The exit status is 1 if any value differs.
     """
-    from pipeline.manage.verify import verify
+    from pipeline.manage import verify as verifying
 
-    sys.exit(verify(ROOT, names or list(checked_plan().scenes), against, typer.echo))
-
-
-@app.command(rich_help_panel=MAINTENANCE)
-def check_cache() -> None:
-    """Look for damaged files in DVC's cache, move them out of the cache, and print how to restore them."""
-    from pipeline.manage import cache
-
-    sys.exit(cache.check(ROOT, typer.echo))
+    sys.exit(verifying.verify(ROOT, names or list(checked_plan().scenes), typer.echo))
 
 
 @app.command(rich_help_panel=MAINTENANCE)
@@ -362,11 +267,11 @@ def readme(
     """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
-    changed, scenes_shown = fill_pages(ROOT, write=not check)
+    changed = fill_pages(ROOT, write=not check)
     if check and changed:
         typer.echo(f"out of date: {', '.join(changed)}; to write them again: reskin readme", err=True)
         sys.exit(1)
-    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(scenes_shown)}")
+    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}")
 
 
 @scenes.command("list")
@@ -387,27 +292,11 @@ def use(
 ) -> None:
     """Choose the scenes that `dvc repro` runs."""
     from pipeline import plan
-    from pipeline.manage import tidy as tidying
+    from pipeline.manage.lock import changing
 
-    plan.use(ROOT, names)
+    with changing(ROOT):
+        plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
-    if stale := tidying.stale_outputs(ROOT, checked_plan()):
-        typer.echo(
-            f"There are still results of stages that no longer run: {', '.join(stale)}. To delete them: reskin scenes "
-            "tidy"
-        )
-
-
-@scenes.command()
-def tidy() -> None:
-    """Delete the results of experiments that the scenes in the plan no longer run."""
-    from pipeline.manage import tidy as tidying
-
-    stale = tidying.tidy(ROOT, checked_plan())
-    for stage, paths in stale.items():
-        typer.echo(f"removed {stage}: {', '.join(map(str, paths)) or 'no files, because other stages use them'}")
-    if not stale:
-        typer.echo("nothing to remove")
 
 
 @scenes.command()

@@ -1,4 +1,4 @@
-"""Executors that run calls in worker processes, in this process or on a cluster; RESKIN_EXECUTOR selects one.
+"""Executors that run calls in worker processes, in this process or on a Dask cluster; RESKIN_EXECUTOR selects one.
 
 RESKIN_EXECUTOR is an environment variable rather than a setting, because the hash of a training run must not depend on
 where the training runs.
@@ -6,30 +6,41 @@ where the training runs.
 
 import multiprocessing
 import os
+import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
+from importlib.metadata import version
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
+from pathlib import Path
 from typing import Any
 
-from reskin.errors import ParamsError
+import pipeline
+import reskin
+from reskin.code import package_digest
+from reskin.errors import ParamsError, require
+from reskin.numerics import DEVICE_VARIABLE, device, signature
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT, HERE = "processes:2", "here"
 CLUSTER = "dask:"  # prefix of the address of a running scheduler
+HELP = "docs/cluster.md describes how to start workers."
+CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0
+PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
+CODE = (".py", ".json", ".safetensors")  # settings may differ, because they are sent with each call
 
 
-def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
+def make_executor(tasks_n: int = 2, *, imports: str) -> AbstractContextManager[Executor]:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2), `here`, or `dask:ADDRESS`.
 
-    Each worker process has one thread. If the variable is not set, a single task runs in this process. The worker
+    Each worker process has one thread. If the variable is not set, a single task runs in this process. Local worker
     processes are forked from a server that has imported module `imports`.
     """
     if address := _scheduler_address():
-        from pipeline.cluster import Cluster  # imported only if needed, because Dask is optional
-
-        return Cluster(address, imports)
+        return _cluster_executor(address)
     workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
     return ProcessPoolExecutor(workers_n, _context(imports), _end_with_parent) if workers_n else InProcessExecutor()
 
@@ -100,3 +111,61 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=exit_with_parent, daemon=True).start()
+
+
+@contextmanager
+def _cluster_executor(address: str) -> Iterator[Executor]:
+    """Connect to a Dask scheduler, check its workers, and make Dask's own executor."""
+    require("distributed", VARIABLE)
+    from distributed import Client, KilledWorker  # imported here, because Dask is optional
+
+    try:
+        client = Client(address, timeout=CONNECT_MAX_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        what = f"the scheduler at {address} did not answer within {CONNECT_MAX_s:g} s ({str(error)[:80]})"
+        raise ParamsError(f"{VARIABLE}: {what}. {HELP}") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_MAX_s)
+        except TimeoutError:
+            raise ParamsError(f"{VARIABLE}: the scheduler at {address} has no workers. {HELP}") from None
+        check_workers(client)
+        executor = client.get_executor(pure=False)  # calls write files, so equal calls must run again
+        try:
+            yield executor
+        except CancelledError:  # Dask cancels calls if it loses the scheduler
+            remedy = "Finished training runs are cached. Start the scheduler again, then repeat the command."
+            raise ParamsError(f"{VARIABLE}: lost the Dask scheduler at {address}. {remedy}") from None
+        except KilledWorker as error:
+            raise BrokenExecutor(str(error)) from None
+        finally:
+            executor.shutdown(wait=False)  # cancels the calls that a failed or terminated stage has left
+
+
+def check_workers(client: Any) -> None:
+    """Raise `ParamsError` if results of a worker of a `distributed.Client` could differ from those of this process."""
+    expected = {"number of threads": "1", **describe_process()}
+    threads_n: Mapping[str, int] = client.nthreads()
+    for worker, properties in client.run(describe_process).items():
+        found = {"number of threads": str(threads_n[worker]), **properties}
+        for name, value in expected.items():
+            if (got := found.get(name, "nothing")) != value:
+                raise ParamsError(VARIABLE, f"{name} of worker {worker}", value, got, f"Restart the worker. {HELP}")
+
+
+def describe_process() -> dict[str, str]:
+    """Return the properties of this process on which every bit of a result depends, and its working directory."""
+    return {
+        "working directory": os.getcwd(),  # calls read and write files by paths relative to the checkout
+        "code": _code_digest(),
+        "Python": sys.version.split()[0],
+        **{name: version(name) for name in ("numpy", "scipy", "numba", "torch")},
+        DEVICE_VARIABLE: device(),
+        "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "unset"),
+        "environment variables of numerics": ", ".join(signature()),
+    }
+
+
+@cache  # a worker continues to use the code that it has imported, even if the files are edited later
+def _code_digest() -> str:
+    return package_digest(*PACKAGES, suffixes=CODE)

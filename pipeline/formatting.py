@@ -1,20 +1,17 @@
 """Scores as text (means, deviations, intervals, paired differences), and tables as Markdown."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pipeline.paper import Number
-from pipeline.statistics import UNDECIDED, Stat, as_json
+from pipeline.statistics import Stat, as_json
 
 Statistic = Stat | Mapping[str, Any]  # a statistic, or its entry in numbers.json
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
-FEW_POINTS = 5.0  # assumed; the paper says of a drop of 3.4 points that it "slightly affects performance"
 MEANING = (
     "Accuracy: percentage of held-out readings whose predicted x and y are both within 1 mm of the true position. "
     "MSE_xy: mean squared error of the position, averaged over x and y."
@@ -40,18 +37,7 @@ TITLES = {
     "network": "the paper's network", "knn-raw": "k nearest neighbours (dB)",
     "knn-shape": "k nearest neighbours (direction and length of dB)",
 }  # fmt: skip
-INCONCLUSIVE = "inconclusive"
 DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
-
-
-def reworded(text: str) -> str:
-    """Replace the verdict `UNDECIDED` of experiments by the word that reports show.
-
-    >>> reworded("undecided: +0.1"), reworded("Undecided: the interval includes the threshold.")
-    ('inconclusive: +0.1', 'Inconclusive: the interval includes the threshold.')
-    """
-    pairs = ((UNDECIDED, INCONCLUSIVE), (UNDECIDED.capitalize(), INCONCLUSIVE.capitalize()))
-    return reduce(lambda found, pair: re.sub(rf"\b{pair[0]}\b", pair[1], found), pairs, text)
 
 
 def show(value: Statistic | None) -> str:
@@ -151,12 +137,6 @@ def show_both(value: Statistic | None) -> str:
 def show_difference(value: Statistic | None) -> str:
     """Write a mean difference with its sign."""
     return "–" if value is None else ("+" if Stat.of(value).mean > 0 else "") + show(value)
-
-
-def gain(difference: Statistic, metric: str) -> Stat:
-    """Return the difference with a sign such that positive is better; differences of errors are negated."""
-    stat = Stat.of(difference)
-    return -stat if metric.startswith("mse_") else stat
 
 
 def _show_seeds(stat: Stat) -> str:

@@ -53,8 +53,8 @@ SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_fxy_N2": (0.0011, 0.0002),
     "mse_fz_N2": (0.003, 0.001),
 }
-MANUAL_POKES_N = 325  # section 5, manual indentations; the paper gives no deviations
-MANUAL: dict[str, dict[str, float]] = {
+MANUAL_POKES_N = 325  # section 5, manual indentations
+MANUAL: dict[str, dict[str, float]] = {  # section 5, manual indentations; the paper gives no deviations
     "before": {"accuracy_pct": 79.86, "mse_xy_mm2": 0.676, "mse_f_N2": 0.268},
     "after": {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192},
 }
@@ -73,17 +73,12 @@ FLEXIBLE: dict[str, float] = {
     "mse_xy_mm2": 0.72,
     "mse_f_N2": 0.54,
 }  # section 5, after adaptation; the paper writes "about" before these numbers
-FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: reduction of the distance between skin and circuit board
 SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
 SENSITIVITY_ML = 20.0
 LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
 SLEEVE: dict[str, float] = {"rate_hz": 133.0, "chips_n": 40}  # section 6: "samples all 40 magnetometers at 133 Hz"
-FORCE_RESOLUTION_MAX_N = 0.1  # section 1: requirement for a good skin
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
-LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even beyond 50K interactions"
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: "seems to plateau" beyond this number
 MONOTONIC = '"monotonically increasing sensor measurements"'
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'
-
-SINGLE_TRAIN_N = 45_000  # section 4: "random 45K for training and 5K for test"

@@ -10,7 +10,6 @@ from ruamel.yaml import YAML
 from pipeline import PLAN, SCENES
 from pipeline.catalogue import ANALYSES, EXPERIMENTS, Experiment, stages
 from pipeline.manage.registry import Registry, read_registry
-from pipeline.manage.running import DVC_FILES, require_idle
 from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Scene, read_scene, scene_file
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
@@ -125,8 +124,7 @@ def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Write the plan for exactly these scenes; raise an error if `dvc repro` runs, because its stages read the plan."""
-    require_idle(root)
+    """Write the plan for exactly these scenes."""
     plan = plan_of(root, names)
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
@@ -140,7 +138,7 @@ def _keep_outputs(root: Path) -> None:
     DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete listed
     outputs that no stage of the current plan writes. This function therefore empties the list.
     """
-    if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
+    if not (root / ".dvc/tmp").is_dir():  # DVC has not run in this checkout
         return
     from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo

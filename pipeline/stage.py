@@ -2,20 +2,29 @@
 
 import argparse
 import inspect
+import multiprocessing
+import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
-from pipeline.progress import stage_position
 from pipeline.provenance import COSTS, clear_cost, record_cost
 from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
+WATCH_s, CLEAN_UP_MAX_s = 0.2, 5.0
 
-def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`."""
+
+def run(function: Callable[..., None], arguments: Sequence[str]) -> str:
+    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`.
+
+    Returns the name of the scene.
+    """
+    end_with_dvc()
     stage = function.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=function.__doc__)
     parser.add_argument("--scene", required=True)
@@ -25,8 +34,6 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     options = vars(parser.parse_args(arguments))
     scene = options.pop("scene")
-    if position := stage_position():
-        say(f"{stage}: {position}")
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
@@ -41,6 +48,7 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
+    return str(scene)
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
@@ -51,6 +59,30 @@ def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
         protocol = options["raw"].name.removeprefix(scene).strip("-")
         return f"{stage}-{protocol}" if protocol else stage
     return stage
+
+
+def end_with_dvc() -> None:
+    """End this process and its workers on SIGTERM, and also when DVC, which started it, has ended.
+
+    DVC does not end the stage that it runs when DVC itself is terminated or killed.
+    """
+    parent = os.getppid()
+
+    def terminate(number: int, frame: object) -> None:
+        for worker in multiprocessing.active_children():
+            worker.terminate()  # otherwise, the stage would wait for the results of running calls
+        sys.exit(128 + number)  # an exception, so that temporary files are removed
+
+    def watch_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_s)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(CLEAN_UP_MAX_s)
+        os._exit(128 + signal.SIGTERM)  # perhaps the main thread is in a long computation outside Python
+
+    signal.signal(signal.SIGTERM, terminate)
+    if "DVC_STAGE" in os.environ:  # set by DVC for the command of a stage
+        threading.Thread(target=watch_parent, daemon=True).start()
 
 
 def say(sentence: str) -> None:

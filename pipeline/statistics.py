@@ -27,17 +27,6 @@ PERCENTAGES = (
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
 BOARDS_MIN = 4  # with fewer boards, no interval is computed; the value of each board is given instead
-SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
-FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
-VERDICTS = (
-    "Supported: the whole 95 % interval is on the claim's side of the threshold, which is 0 unless another threshold "
-    "is stated. Contradicted: the whole interval is on the other side. Undecided: the interval includes the threshold. "
-    f"Not judged: with fewer than {BOARDS_MIN} boards there is no interval, and the values of the boards are given. "
-    "Intervals are over boards (Student's t): the value of a board is the mean over its skins and networks. So that "
-    "intervals contain only possible values, they are computed from the logit of accuracies and from the logarithm of "
-    "squared errors. Differences are not transformed. The networks for two tested boards are trained partly on the "
-    "same boards; the intervals do not account for this."
-)
 
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
 
@@ -87,12 +76,6 @@ class Stat:
     def few(self) -> bool:
         """Whether there are so few boards that their values replace the interval."""
         return self.values is not None
-
-    def __neg__(self) -> "Stat":
-        """Change the sign of a difference: its mean, its interval and its values."""
-        ci95 = None if self.ci95 is None else (-self.ci95[1], -self.ci95[0])
-        values = None if self.values is None else tuple(-value for value in self.values)
-        return replace(self, mean=-self.mean, ci95=ci95, values=values)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of numbers.json: what is known, by name."""
@@ -180,6 +163,34 @@ def p_value(mean: float, se: float, df: float) -> float:
     if se == 0:
         return 1.0 if mean == 0 else 0.0
     return float(2 * stdtr(df, -abs(mean) / se))
+
+
+def p_value_of(stat: Stat, mean: float, metric: str = "") -> float:
+    """Compute the two-sided p-value of the null hypothesis that the mean over boards equals `mean`, by Student's t.
+
+    It agrees with the interval of `t_interval`: it is below 0.05 if and only if `mean` is outside `stat.ci95`. If
+    `mean` is not a possible value of the metric, it is 0.
+    """
+    from scipy.special import stdtrit
+
+    assert stat.ci95 is not None, "the statistic has an interval over boards"
+    df = stat.df or min(filter(None, (stat.training_n, stat.boards_n)), default=stat.n) - 1
+    metric = metric if stat.ci95[0] < stat.ci95[1] else ""
+    low, high, ours, null = _transform(np.array([*stat.ci95, stat.mean, mean]), metric)
+    se = (high - low) / 2 / stdtrit(df, (1 + CONFIDENCE) / 2)
+    return p_value(ours - null, se, df) if np.isfinite(null) else 0.0
+
+
+def _transform(values: Float[np.ndarray, " n"], metric: str) -> Float[np.ndarray, " n"]:
+    """Apply the transformation g of `t_interval`."""
+    from scipy.special import logit
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if metric in PERCENTAGES:
+            return np.asarray(logit(values / 100))
+        if metric.startswith("mse_"):
+            return np.log(values)
+        return -np.log(1 - values) if metric in AT_MOST_1 else values
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
@@ -381,32 +392,3 @@ def _unpaired(skins: Sequence[Any]) -> SchemaError:
         "a paired difference needs scores of both methods on the same held-out skins, but only one method has scores "
         f"on {skins}. {remedy}"
     )
-
-
-# --- Verdicts ---
-
-
-def verdict(stat: Stat, *, above: float = 0.0) -> str:
-    """Judge from the 95 % interval whether a mean over boards is above a threshold."""
-    if stat.ci95 is None:
-        return FEW_BOARDS
-    low, high = stat.ci95
-    return SUPPORTED if low > above else CONTRADICTED if high < above else UNDECIDED
-
-
-def verdict_within(stat: Stat, margin: float) -> str:
-    """Judge from the 95 % interval whether a mean over boards is nearer to 0 than `margin` (a test of equivalence)."""
-    if stat.ci95 is None:
-        return FEW_BOARDS
-    low, high = stat.ci95
-    if -margin < low and high < margin:
-        return SUPPORTED
-    return CONTRADICTED if low > margin or high < -margin else UNDECIDED
-
-
-def combine_verdicts(verdicts: Sequence[str]) -> str:
-    """Judge a claim with several parts from the verdicts on its parts.
-
-    The claim is contradicted if any part is contradicted, and supported if all parts are supported.
-    """
-    return next((verdict for verdict in (CONTRADICTED, FEW_BOARDS, UNDECIDED) if verdict in verdicts), SUPPORTED)

@@ -24,8 +24,7 @@ from reskin.errors import ParamsError, ReskinError, explaining
 # Commands of `pipeline.cli`, which can be run only in a checkout of the project. Outside a checkout, the list is needed
 # for the help, and for the error message if a user runs one of these commands.
 CHECKOUT_COMMANDS = (
-    "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes",
-    "summary", "verify-reports",
+    "add", "fetch", "model", "new", "publish", "readme", "remove", "scenes", "verify",
 )  # fmt: skip
 
 BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (

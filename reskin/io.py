@@ -33,8 +33,8 @@ COUNTS_KEY = b"reskin.account"  # key of the ingestion counts in the metadata of
 DIGEST = "digest"  # key of the digest in the metadata of a safetensors file
 HEADER_AT = 8  # position of the header in a safetensors file; the bytes before it contain the length of the header
 REMEDY = (
-    "The file is incomplete, or it was changed after it was written. If `dvc repro` wrote the file, delete the file, "
-    "then run `reskin check-cache` and `dvc repro`. Otherwise, copy the file again from where you got it."
+    "The file is incomplete, or it was changed after it was written. If `dvc repro` wrote the file, delete the file "
+    "and DVC's copies (.dvc/cache/files), then run `dvc repro`. Otherwise, copy the file again from where you got it."
 )
 MACHINE_ERRNOS = {
     errno.EACCES,

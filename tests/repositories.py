@@ -1,4 +1,4 @@
-"""Git repositories for tests, which replace the public repositories of recordings."""
+"""Git repositories for tests, with recordings."""
 
 import subprocess
 from collections.abc import Mapping
@@ -23,10 +23,3 @@ def commit(folder: Path, files: Mapping[str, bytes]) -> str:
     git(folder, "-c", "core.autocrlf=false", "add", "--all")
     git(folder, "commit", "--quiet", "--message", "recordings")
     return git(folder, "rev-parse", "HEAD")
-
-
-def bare(folder: Path, mirror: Path, *, filters: bool) -> str:
-    """Create a bare clone and return its URL; with `filters`, clients may fetch commits without their files."""
-    subprocess.run(["git", "clone", "--quiet", "--bare", str(folder), str(mirror)], check=True)
-    git(mirror, "config", "uploadpack.allowFilter", str(filters).lower())
-    return mirror.as_uri()

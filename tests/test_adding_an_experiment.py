@@ -140,9 +140,9 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
 
 def test_edit_of_a_caption_reruns_the_stages_that_show_it_and_edits_of_comments_rerun_no_stage(root, before):
     # Both edits are made at once, because each call of `state` takes seconds.
-    captions, io = "pipeline/report/page.yaml", "reskin/io.py"
+    captions, io = "pipeline/report/tables.yaml", "reskin/io.py"
     edits = {
-        captions: (root / captions).read_text().replace("title: ", "title: More ", 1),
+        captions: (root / captions).read_text() + "more: A caption.\n",
         io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1),
     }
     with edited_files(root, edits):

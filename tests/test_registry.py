@@ -1,7 +1,16 @@
 import pytest
 
-from pipeline.manage.registry import Entry, Registry, with_entry, without_capture
+from pipeline.manage.registry import (
+    REGISTRY,
+    Entry,
+    Registry,
+    read_registry,
+    with_entry,
+    without_capture,
+    write_registry,
+)
 from reskin.errors import CaptureError
+from tests.repositories import commit, git
 
 EMPTY = Registry(captures={})
 
@@ -60,3 +69,47 @@ def test_unknown_capture_cannot_be_removed():
         without_capture(ONE, "lab", "c7")
     with pytest.raises(CaptureError, match="scene lba has no recorded captures. Did you mean lab"):
         without_capture(ONE, "lba", "c0")
+
+
+def entry(board: str, skin: str, fingerprint: str) -> Entry:
+    return Entry(board=board, skin=skin, layout="table", chips_n=5, fingerprints=(fingerprint,), copy_of=None)
+
+
+@pytest.fixture
+def branches(tmp_path):
+    """Return a function that merges two branches of a git repository, each with one capture, and reads the registry."""
+
+    def merge(*entries: Entry) -> Registry:
+        write_registry(tmp_path, Registry(captures={"lab": {"c0": entry("b0", "s0", "00")}}))
+        base = commit(tmp_path, {".gitattributes": f"{REGISTRY} merge=union\n".encode()})
+        for name, added in zip(("mine", "theirs"), entries, strict=True):
+            git(tmp_path, "checkout", "--quiet", "-b", name, base)
+            captures = read_registry(tmp_path).captures["lab"]
+            write_registry(tmp_path, Registry(captures={"lab": captures | {name: added}}))
+            commit(tmp_path, {})
+        git(tmp_path, "merge", "--quiet", "mine", "-m", "both")
+        return read_registry(tmp_path)
+
+    (tmp_path / "data").mkdir()
+    git(tmp_path, "init", "--quiet")
+    return merge
+
+
+def test_git_merges_captures_of_two_branches(branches):
+    assert sorted(branches(entry("b1", "s1", "11"), entry("b2", "s2", "22")).captures["lab"]) == [
+        "c0",
+        "mine",
+        "theirs",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "message"),
+    [
+        (("b1", "s1", "11"), ("b2", "s1", "22"), "skin s1 is on two boards, b2 and b1"),
+        (("b1", "s1", "11"), ("b2", "s2", "11"), "has the same readings as another capture"),
+    ],
+)
+def test_merged_captures_that_contradict_each_other_are_an_error(branches, mine, theirs, message):
+    with pytest.raises(CaptureError, match=message):
+        branches(entry(*mine), entry(*theirs))

@@ -30,6 +30,7 @@ OPTIONAL = (
     "dvc",
     "grimp",
     "jinja2",
+    "markdown-it-py",
     "magpylib",
     "matplotlib",
     "mlflow",
@@ -118,7 +119,7 @@ def test_imported_packages_are_declared():
     graph = grimp.build_graph("pipeline", "reskin", include_external_packages=True, cache_dir=None)
     names = {module.partition(".")[0] for module in graph.modules}
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
-    known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
+    known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "markdown_it": "markdown-it-py"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
     required = {re.split(r"[\[<>=]", line)[0] for line in lines}
     # These are packages of ROS 2, which pip cannot install.
@@ -135,7 +136,7 @@ def test_version_is_the_same_everywhere():
 
 def test_supported_versions_of_python_are_the_same_everywhere():
     classified = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
-    (made,) = re.findall(r"^PYTHONS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    (made,) = re.findall(r"for version in (.*); do", (ROOT / "tools/test_pythons.sh").read_text(encoding="utf-8"))
     workflow = read_yaml(ROOT / ".github/workflows/test.yml")
     assert made.split() == workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == classified
     supported = SpecifierSet(PROJECT["requires-python"])

@@ -1,4 +1,4 @@
-"""Tests of `reskin verify-reports`: reports of a new run, or finished reports, are compared with the last commit."""
+"""Tests of `reskin verify`: numbers of a new run are compared with those of the last commit."""
 
 import json
 import subprocess
@@ -11,19 +11,15 @@ from pipeline.cli import app
 from pipeline.manage import verify
 from reskin import io
 
-SCORES = "question,fold,accuracy_pct\nlobo,b0,{}\n"
 
-
-def write(reports, accuracy_pct, score=80.0, model="network"):
-    io.write_json(reports / "numbers.json", {"table2": {"accuracy_pct": {"mean": accuracy_pct}}})
-    io.write_text(reports / "tables/scores.csv", SCORES.format(score))
-    io.write_text(reports / "tables/table2.csv", f'model,"accuracy, %"\n{model},{accuracy_pct}\n')
+def write(reports, numbers):
+    io.write_json(reports / "numbers.json", numbers)
 
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """Return a git checkout whose committed reports have an accuracy of 80 %."""
-    write(tmp_path / "reports/quick", 80.0)
+    write(tmp_path / "reports/quick", {"table2": {"mean": 80.0, "n": 1}, "seed": 1})
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     for name in ("quick", "lab"):
         io.write_text(tmp_path / SCENES / f"{name}.yaml", "")
@@ -35,57 +31,40 @@ def checkout(tmp_path, monkeypatch):
     return tmp_path
 
 
-def run_command(*arguments: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["verify-reports", *arguments])
-    return done.exit_code, done.output
-
-
 @pytest.mark.parametrize(
-    ("changed", "status", "expected"),
+    ("fresh", "lines"),
     [
-        ((80.0,), 0, "quick: reproduced: all 6 values"),
-        ((90.0,), 1, "| table2.accuracy_pct.mean "),
-        ((80.0, 70.0), 1, "| scores[lobo].accuracy_pct "),
-        ((80.0, 80.0, "ridge"), 1, "| tables | table2    | 1       | 1        |"),
+        ({"table2": {"mean": 80.0, "n": 1}, "seed": 1}, []),
+        ({"table2": {"mean": 90.0, "n": 1}, "seed": 1}, ["table2.mean: committed 80.0, now 90.0"]),
+        ({"table2": {"mean": 80.0, "n": True}, "seed": 1}, ["table2.n: committed 1, now true"]),
+        (
+            {"table2": {"mean": 80.0, "n": 1}, "rows": [2]},
+            ["seed: committed 1, now missing", "rows[0]: committed missing, now 2"],
+        ),
     ],
 )
-def test_finished_reports_are_compared_with_those_of_the_last_commit(
-    checkout, tmp_path_factory, changed, status, expected
-):
-    other = tmp_path_factory.mktemp("other")
-    write(other / "quick", *changed)
-    write(checkout / "reports/quick", 0.0)  # reports in the working tree must be ignored
-    code, output = run_command("quick", "--against", str(other))
-    assert code == status
-    assert expected in output
-
-
-def test_rerun_starts_without_old_reports_and_keeps_its_new_reports(checkout, monkeypatch):
+def test_rerun_starts_without_old_reports_and_differing_values_are_listed(checkout, monkeypatch, fresh, lines):
     def run(clone, environment, *arguments, quiet=False):
         if arguments[0] == "dvc":
             assert not list((clone / "reports/quick").glob("*"))
             assert arguments[-1] == "report@quick"
-            write(clone / "reports/quick", 90.0)
+            write(clone / "reports/quick", fresh)
 
     monkeypatch.setattr(verify, "_run", run)
-    code, output = run_command("quick")
-    assert code == 1
-    assert "| 80          | 90      |" in output
+    write(checkout / "reports/quick", {"table2": "of the working tree, which is ignored"})
+    done = CliRunner().invoke(app, ["verify", "quick"])
+    assert done.exit_code == bool(lines)
+    assert done.output.splitlines()[1:-1] == [f"quick: {line}" for line in lines]
     kept = json.loads((checkout / verify.VERIFIED / "quick/numbers.json").read_text())
-    assert kept["table2"]["accuracy_pct"]["mean"] == 90.0
-    assert json.loads((checkout / "reports/quick/numbers.json").read_text())["table2"]["accuracy_pct"]["mean"] == 80.0
+    assert kept["table2"] == fresh["table2"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["lab"], "has no reports/lab/numbers.json"),
-        (["zzz"], "no scene zzz. The scenes are: lab, quick"),
-        (["quick", "--against", "data"], "data: this folder contains no quick/numbers.json"),
-    ],
+    ("scene", "message"),
+    [("lab", "reports/lab/numbers.json"), ("zzz", "no scene zzz. The scenes are: lab, quick")],
 )
-def test_missing_reports_are_an_error(checkout, arguments, message):
-    done = CliRunner().invoke(app, ["verify-reports", *arguments])
+def test_scene_without_committed_report_is_an_error(checkout, scene, message):
+    done = CliRunner().invoke(app, ["verify", scene])
     assert message in str(done.exception)
 
 

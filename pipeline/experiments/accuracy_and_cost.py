@@ -29,7 +29,7 @@ from scipy.constants import micro, milli, mu_0
 from scipy.integrate import solve_ivp
 
 from pipeline.experiments.results import write_results
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import drawing, svg
 from pipeline.provenance import SECONDS
 from pipeline.settings import Adaptations, Settings, Training
 from pipeline.simulation import simulation_settings
@@ -495,31 +495,21 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     studies = list(dict.fromkeys(row["study"] for row in rows))
     if not studies:
         return {}
-    with drawing(7.6, 2.3 * ceil(len(studies) / 2)) as figure:
-        panels = figure.subplots(ceil(len(studies) / 2), 2, squeeze=False).ravel()
-        for axes, study in zip(panels, studies, strict=False):
+    with drawing(0.4 + 2.5 * len(studies), f"Error against run time ({source})") as figure:
+        panels = figure.subplots(len(studies), 1, squeeze=False)[:, 0]
+        for axes, study in zip(panels, studies, strict=True):
             _panel(axes, [row for row in rows if row["study"] == study])
             for row in numbers["rows"]:
                 if (row["study"], row["method"]) == (study, REFERENCE):
-                    axes.axhline(row["error"], color="0.5", linestyle=":", linewidth=1, label=row["setting"])
-                    axes.axhline(ERROR_MAX, color="0.3", linestyle="--", linewidth=1, label=f"limit {ERROR_MAX:.0%}")
-            axes.legend(frameon=False, fontsize=6.5)
-        for axes in panels[len(studies) :]:
-            axes.axis("off")
-        figure.suptitle(f"Error against run time ({source})", x=0.01, ha="left", fontsize=10)
+                    axes.axhline(row["error"], color="0.5", linestyle=":", label=row["setting"])
+                    axes.axhline(ERROR_MAX, color="0.3", linestyle="--", label=f"limit {ERROR_MAX:.0%}")
+            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.28), ncols=2)
         return {"accuracy_and_cost.svg": svg(figure)}
 
 
 def _panel(axes: Any, rows: Sequence[Mapping[str, Any]]) -> None:
     unit = "relative error" if rows[0]["unit"] == "1" else f"MSE_xy / {rows[0]['unit']}"
-    axes.set(xscale="log", yscale="log", xlabel="run time / s", ylabel=unit)
-    axes.set_title(rows[0]["study"], loc="left", fontsize=9)
-    for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
-        points = sorted((row["seconds"], max(row["error"], SHOWN_MIN)) for row in rows if row["method"] == method)
-        look = {
-            "color": COLOURS[i % len(COLOURS)],
-            "marker": MARKERS[i % len(MARKERS)],
-            "markersize": 4,
-            "linewidth": 1,
-        }
-        axes.plot(*zip(*points, strict=True), label=method, **look)
+    axes.set(xscale="log", yscale="log", xlabel="run time / ms", ylabel=unit, title=rows[0]["study"])
+    for method in dict.fromkeys(row["method"] for row in rows):
+        points = sorted((1e3 * row["seconds"], max(row["error"], SHOWN_MIN)) for row in rows if row["method"] == method)
+        axes.plot(*zip(*points, strict=True), label=method)

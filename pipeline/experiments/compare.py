@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
 from reskin.physics.skin import SkinDesign
@@ -123,17 +123,16 @@ def _outline(axes: BoardAxes) -> dict[str, Any]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot recorded and simulated |dB| against the force, one panel per board with known forces."""
-    if not drawn["boards"]:
+    boards = drawn["boards"]
+    if not boards:
         return {}
-    with drawing(3.6 * len(drawn["boards"]) + 0.6, 3.6) as figure:
-        panels = figure.subplots(1, len(drawn["boards"]), squeeze=False)[0]
-        for axes, (board, of_board) in zip(panels, drawn["boards"].items(), strict=True):
-            for side, colour, marker in zip(("recorded", "simulated"), COLOURS, MARKERS, strict=False):
+    with drawing(0.4 + 2.4 * len(boards), f"Change of field against force ({source})") as figure:
+        panels = figure.subplots(len(boards), 1, squeeze=False)[:, 0]
+        for axes, (board, of_board) in zip(panels, boards.items(), strict=True):
+            for side in ("recorded", "simulated"):
                 slope = numbers["by_board"][board].get("growth", {}).get(side)
                 label = side if slope is None else f"{side}: power {slope:.2f}"
-                style = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
-                axes.plot(of_board["force_N"], of_board["length_uT"][side], label=label, **style)
+                axes.plot(of_board["force_N"], of_board["length_uT"][side], label=label, linestyle="", alpha=0.6)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
-            axes.legend(frameon=False, fontsize=8)
-        figure.suptitle(f"Change of field against force ({source})", x=0.01, ha="left", fontsize=11)
+            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.25), ncols=2)
         return {"compare_growth.svg": svg(figure)}

@@ -19,7 +19,7 @@ from pipeline import statistics
 from pipeline.description import first_rows, pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import COLUMNS, show_difference
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs
@@ -361,8 +361,6 @@ def points(forces: pd.DataFrame) -> dict[str, list[float]]:
 
 # --- Figures ---
 
-MARGIN = 0.05  # margin of the axes of figure 5b, as a fraction of the range of forces
-
 
 def policies_in(numbers: Mapping[str, Any]) -> dict[str, str]:
     """Return the title of each no-load policy that was tested."""
@@ -379,41 +377,33 @@ def _draw_scores(numbers: Mapping[str, Any], source: str) -> str:
     titles = policies_in(numbers)
     error = "mse_f_N2" if "mse_f_N2" in numbers[next(iter(titles))][0] else "mse_xy_mm2"
     networks_n = numbers["skins_n"] * numbers["seeds_n"]
-    with drawing(7.6, 4.0) as figure:
-        for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", error), strict=True):
+    with drawing(5.6, f"Networks of the first contacts, tested on later ones ({source})") as figure:
+        panels = figure.subplots(2, 1, sharex=True)
+        for axes, metric in zip(panels, ("accuracy_pct", error), strict=True):
             for policy, title in titles.items():
-                i, rows = list(POLICIES).index(policy), numbers[policy]
+                rows = numbers[policy]
                 bars = [row["spread"][metric] for row in rows] if networks_n > 1 else None
-                style = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
-                contacts_n = [row["contacts_n"] for row in rows]
-                axes.errorbar(contacts_n, [row[metric] for row in rows], bars, label=title, **style)
+                look = {"color": COLOURS[list(POLICIES).index(policy)], "label": title}
+                axes.errorbar([row["contacts_n"] for row in rows], [row[metric] for row in rows], bars, **look)
             axes.set_ylabel(COLUMNS[metric].replace(", ", " / "))
-            axes.set_xlabel("contacts of the skin before the test")
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
-            axes.set_xlim(left=0)
-            axes.grid(alpha=0.25)
-        axes.set_yscale("log")
-        figure.axes[0].set_ylim(0, 102)
-        bars_are = f"; bars: standard deviation over {networks_n} networks" if networks_n > 1 else ""
-        names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, frameon=False, title=f"no-load reading{bars_are}")
-        figure.suptitle(
-            f"Networks trained on the first contacts, tested on later contacts ({source})",
-            x=0.01, ha="left", fontsize=11,
-        )  # fmt: skip
+        panels[0].set_ylim(0, 102)
+        panels[1].set(yscale="log", xlabel="contacts of the skin before the test", xlim=(0, None))
+        panels[1].xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+        bars_are = f"; bars: standard deviation of {networks_n} networks" if networks_n > 1 else ""
+        names = panels[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower left", alignment="left", title=f"no-load reading{bars_are}")
+        figure.align_ylabels()
         return svg(figure)
 
 
 def _draw_forces(numbers: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
     late = numbers["late"]
-    with drawing(5.2, 5.0) as figure:
+    with drawing(4.6, f"Force after {late['contacts_n']:,} contacts ({source})") as figure:
         axes = figure.subplots()
-        ends = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
-        room = MARGIN * (ends[1] - ends[0])
-        limits = (ends[0] - room, ends[1] + room)
-        axes.plot(limits, limits, color="0.5", linewidth=1, linestyle="--", label="predicted = true")
+        ends_N = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
+        axes.plot(ends_N, ends_N, color="0.5", marker="", linestyle="--", label="predicted = true")
         axes.scatter(points["true_N"], points["predicted_N"], s=9, color=COLOURS[1], alpha=0.5, linewidths=0)
-        axes.set(xlabel="true force / N", ylabel="predicted force / N", xlim=limits, ylim=limits, aspect="equal")
+        axes.set(xlabel="true force / N", ylabel="predicted force / N", aspect="equal")
         bias = {"mean": late["bias_N"], "n": late["indentations_n"], "sd": late["bias_se_N"]}
         text = (
             f"bias {show_difference(bias)} N ({late['bias_pct']:+.2g} %)\n"
@@ -423,8 +413,6 @@ def _draw_forces(numbers: Mapping[str, Any], points: Mapping[str, Sequence[float
             f"means of {len(late['network_bias_N'])} networks\n"
             "points: first seed only"
         )
-        axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=10)
-        axes.legend(loc="lower right", frameon=False)
-        axes.grid(alpha=0.25)
-        figure.suptitle(f"Force after {late['contacts_n']:,} contacts ({source})", x=0.01, ha="left", fontsize=11)
+        axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=8.5)
+        axes.legend(loc="lower right")
         return svg(figure)

@@ -10,7 +10,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import TITLES, show_difference
+from pipeline.formatting import TITLES
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import join, select, write_scores
 from pipeline.settings import Adaptations, Settings
@@ -163,18 +163,12 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     """Plot predicted against true force before and after adaptation, with the diagonal and the bias."""
     every_N = [value for forces in drawn.values() for side in forces.values() for value in side]
     ends_N = [min(every_N), max(every_N)]
-    with drawing(6.4, 3.7) as figure:
+    with drawing(2.9, f"Trained on rigid boards, tested on flexible boards ({source})") as figure:
         panels = figure.subplots(1, len(drawn), sharex=True, sharey=True)
         for axes, (name, forces), colour in zip(panels, drawn.items(), COLOURS[1:], strict=False):
-            axes.plot(ends_N, ends_N, color=COLOURS[0], linewidth=0.8)
+            axes.plot(ends_N, ends_N, color="0.3", marker="", linewidth=0.8)
             axes.scatter(forces["true_N"], forces["predicted_N"], s=7, color=colour, alpha=0.6, linewidths=0)
-            bias = f"bias {show_difference(numbers['bias_f_N'][name])} N"
-            axes.set_title(f"{TITLES[name]}:\n{bias}", loc="left", fontsize=9)
-            axes.set(xlabel="true force / N")
+            bias_N = numbers["bias_f_N"][name]["mean"]
+            axes.set(xlabel="true force / N", title=f"{TITLES[name]}:\nbias {bias_N:+.2f} N")
         panels[0].set_ylabel("predicted force / N")
-        title = (
-            f"Networks trained on rigid boards, tested on flexible boards ({source})\n"
-            f"bias: mean over {numbers['seeds_n']} network seeds; points: first seed"
-        )
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return {"flexible.svg": svg(figure)}

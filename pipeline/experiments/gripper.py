@@ -242,8 +242,8 @@ PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot the deviation of each run's mean force from the aim, one panel per aim."""
     aims_N = list(numbers["aims_N"])
-    with drawing(7.6, 3.8) as figure:
-        panels = figure.subplots(1, len(aims_N), sharey=True, squeeze=False)[0]
+    with drawing(0.9 + 1.8 * len(aims_N), f"Force control by model and known press ({source})") as figure:
+        panels = figure.subplots(len(aims_N), 1, sharex=True, squeeze=False)[:, 0]
         for axes, aim_N in zip(panels, aims_N, strict=True):
             rows = [row for row in drawn["rows"] if row["aim_N"] == aim_N]
             axes.axhspan(-numbers["within_pct"], numbers["within_pct"], color=COLOURS[6], alpha=0.35, linewidth=0)
@@ -251,10 +251,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
                 runs_n = len(row["off_pct"])
                 x = [i + 0.5 * (j + 0.5) / runs_n - 0.25 for j in range(runs_n)]
                 axes.plot(x, row["off_pct"], "o", color=COLOURS[1 + (row["press"] != "none")], markersize=3)
-            labels = [f"{row['feedback']}\n{PRESSES[row['press']]}" for row in rows]
-            axes.set_xticks(range(len(rows)), labels, fontsize=8, rotation=45)
-            axes.set_title(f"{aim_N:g} N", fontsize=10)
-        panels[0].set_ylabel("mean force minus aim / %")
-        title = f"Force control with estimated forces, by model and by use of one known press ({source})"
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+            axes.set(title=f"{aim_N:g} N", ylabel="force minus aim / %")
+        labels = [f"{row['feedback']}\n{PRESSES[row['press']]}" for row in rows]
+        axes.set_xticks(range(len(rows)), labels)
         return {"gripper.svg": svg(figure)}

@@ -24,14 +24,14 @@ import pandas as pd
 from jaxtyping import Float, Float64, Int64
 from pydantic import Field, model_validator
 from scipy.constants import micro, milli
+from tqdm import tqdm
 
 import reskin
 from pipeline import statistics
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import drawing, svg
 from pipeline.scores import make_table, write_scores
 from pipeline.settings import Settings
-from pipeline.stage import say
 from reskin.config import Strict, parse
 from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.data.grid import CENTRE_MM, points_mm
@@ -175,9 +175,8 @@ def run(settings: Settings, section: Interference, raw: Path, indentations: Path
             rng = rng_for(settings.seed, "interference", "touches", sensor.skin)
             rows += contact_rows(sensor, presses, models, rng)
         pooled = pool_changes(sensors)
-        for skin in presses:
+        for skin in tqdm(presses, unit="skin"):
             rows += place_rows(skin, pooled, models, section, settings.seed)
-            say(f"{settings.scene} interference: {skin.skin} scored")
     return make_table({"experiment": "interference"} | row for row in rows)
 
 
@@ -431,20 +430,15 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         own = [row for row in numbers["places"] if row["labels_n"] == labels_n]
         panels[f"within 1 mm / %, {labels_n} labels"] = own, "accuracy_pct"
     names = list(dict.fromkeys(row["field"] for row in numbers["places"]))
-    with drawing(8.0, 3.0 * len(panels)) as figure:
+    with drawing(2.0 + 1.6 * len(panels), f"Changing external fields ({source})") as figure:
         all_axes = figure.subplots(len(panels), 1, sharex=True)
         for axes, (label, (rows, metric)) in zip(all_axes, panels.items(), strict=True):
             ways = dict.fromkeys((row["method"], row["external_uT"]) for row in numbers["contacts"])
-            for i, (method, external_uT) in enumerate(ways):
+            for method, external_uT in ways:
                 own = [row for row in rows if (row["method"], row["external_uT"]) == (method, external_uT)]
-                axes.plot(
-                    [names.index(row["field"]) for row in own], [row[metric]["mean"] for row in own],
-                    color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)],
-                    label=f"{method.replace('_', ' ')}, external_uT {external_uT:g}",
-                )  # fmt: skip
-            axes.set(ylabel=label, ylim=(-4, 104))
-            axes.grid(alpha=0.25)
+                x, name = [names.index(row["field"]) for row in own], method.replace("_", " ")
+                axes.plot(x, [row[metric]["mean"] for row in own], label=f"{name}, external_uT {external_uT:g}")
+            axes.set(title=label, ylim=(-4, 104))
         axes.set_xticks(range(len(names)), [name.replace("_", " ") for name in names], rotation=45, ha="right")
-        handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower left")
         return {"interference.svg": svg(figure)}

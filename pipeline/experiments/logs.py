@@ -142,22 +142,19 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot the estimated and the true force, x and y over time, during contacts only."""
     t_s = np.array(drawn["t_s"])
-    with drawing(7.0, 5.0) as figure:
+    with drawing(4.6, f"Estimates from a log at {numbers['rate_hz']:.0f} Hz ({source})") as figure:
         panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
         for axes, name, quantity in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
             for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):
                 if which in drawn:
-                    axes.plot(t_s, np.array(drawn[which][name], float), color=colour, linewidth=width, label=which)
+                    values = np.array(drawn[which][name], float)
+                    axes.plot(t_s, values, color=colour, linewidth=width, marker="", label=which)
             if "low" in drawn:
                 low, high = (np.array(drawn[which][name], float) for which in ("low", "high"))
                 label = f"range over {numbers['networks_n']} network seeds"
                 axes.fill_between(t_s, low, high, color=COLOURS[1], alpha=0.3, linewidth=0, label=label)
-            axes.set_ylabel(quantity)
-        panels[0].set_ylim(bottom=0)
-        panels[1].set_ylim(-2, 18)  # the grid is 16 mm wide
-        panels[2].set_ylim(-2, 18)
+            axes.set(ylabel=quantity, ylim=(0, None) if name == "F_N" else (-2, 18))  # the grid is 16 mm wide
         panels[2].set_xlabel("time / s")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-        panels[0].set_title(f"Estimates from a log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
+        figure.align_ylabels()
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower left", ncols=3)
         return {"logs.svg": svg(figure)}

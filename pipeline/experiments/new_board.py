@@ -23,14 +23,14 @@ import pandas as pd
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int64
 from pydantic import Field
+from tqdm import tqdm
 
 from pipeline.executors import make_executor
 from pipeline.experiments.results import NO_LOSSES, read_captures, write_results
 from pipeline.formatting import TITLES
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import drawing, svg
 from pipeline.scores import COUNTS, make_table, metrics_of, write_scores
 from pipeline.settings import Adaptations, Settings, Training
-from pipeline.stage import say
 from pipeline.statistics import tally
 from pipeline.training.jobs import SceneData, collapse_record, read_data, read_pretrained, select_pretrained, train_jobs
 from pipeline.training.methods import (
@@ -363,10 +363,8 @@ def new_board(
             for draw in drawn[board.skin]
         ]
         rows = []
-        for i, task in enumerate(tasks, start=1):
+        for task in tqdm(tasks, unit="draw"):
             rows += task.result()
-            if i % 10 == 0:
-                say(f"{settings.scene} new_board: {i} of {len(tasks)} draws scored")
     adapted, trainings = score_adapted(data, boards, drawn, models)
     policy = settings.shared_section(FaultPolicy, "faults")
     contact = score_contact(read_contact(captures, raw, policy))
@@ -452,21 +450,18 @@ def _summary(rows: pd.DataFrame, values: pd.Series) -> dict[str, Any]:
 
 def figures(numbers: Sequence[Mapping[str, Any]], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot place and force against the number of labels, with one panel for each metric (split `checkerboard`)."""
-    panels = {"accuracy_pct": "within 1 mm in x and y / %", "rms_f_N": "force error (rms) / N"}
+    panels = {"accuracy_pct": "within 1 mm / %", "rms_f_N": "force error (rms) / N"}
     rows = [row for row in numbers if row["split"] == CHECKERBOARD]
     rows = [row for row in rows if row["pokes_n"] == max(other["pokes_n"] for other in rows)]
-    with drawing(9.0, 3.6) as figure:
-        for axes, (metric, title) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-            for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
-                points = [
-                    (row["labels_n"], row[metric]["mean"]) for row in rows if row["method"] == method and metric in row
-                ]
-                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
-                if points:
-                    axes.plot(*zip(*sorted(points), strict=True), label=TITLES[method], **style)
-            axes.set(xlabel="labels on the new board", ylabel=title)
-        figure.legend(
-            *figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=8
-        )
-        figure.suptitle(f"Boards that were not in training ({source})", x=0.01, ha="left", fontsize=11)
+    with drawing(5.6, f"Boards that were not in training ({source})") as figure:
+        panels_drawn = figure.subplots(len(panels), 1, sharex=True)
+        for axes, (metric, title) in zip(panels_drawn, panels.items(), strict=True):
+            for method in dict.fromkeys(row["method"] for row in rows):
+                scored = [row for row in rows if row["method"] == method and metric in row]
+                points = sorted((row["labels_n"], row[metric]["mean"]) for row in scored)
+                axes.plot(*np.reshape(points, (-1, 2)).T, label=TITLES[method])
+            axes.set_ylabel(title)
+        axes.set_xlabel("labels on the new board")
+        figure.align_ylabels()
+        figure.legend(*panels_drawn[0].get_legend_handles_labels(), loc="outside lower left")
         return {"new_board.svg": svg(figure)}

@@ -152,23 +152,20 @@ READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's rea
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot the response against weight, and the fraction of correctly ordered pairs against the weight difference."""
-    with drawing(7.6, 3.6) as figure:
-        left, right = figure.subplots(1, 2)
+    with drawing(5.0, f"Response while a glass on the skin is filled ({source})") as figure:
+        upper, lower = figure.subplots(2, 1)
         weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
-        left.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)
-        left.plot(weight_N, response_uT, color=COLOURS[1])
-        left.set(xlabel="weight / N", ylabel="response / µT (mean, standard deviation)")
+        upper.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)
+        upper.plot(weight_N, response_uT, color=COLOURS[1], marker="")
+        upper.set(xlabel="weight / N", ylabel="response / µT (mean, sd)")
         difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
         for colour, (name, title) in zip(COLOURS[1:], READINGS.items(), strict=False):
             share_pct = 100 * np.array(drawn["by_direction"][name])
-            right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=title)
+            lower.plot(difference_N, share_pct, color=colour, marker="o", markersize=3, label=title)
         told_pct = numbers["told_pct"]
-        right.axhline(told_pct, color="0.3", linestyle="--", linewidth=1, label=f"{told_pct:g} %")
-        right.axvline(
-            paper.SENSITIVITY_N, color="0.6", linestyle=":", linewidth=1.2, label="upper bound stated in the paper"
-        )
-        right.set(xscale="log", xlabel="weight difference / N", ylabel="correctly ordered pairs / %")
-        right.set_ylim(48, 102)  # 50 % is chance level
-        right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
-        figure.suptitle(f"Response while a glass on the skin is filled ({source})", x=0.01, ha="left", fontsize=11)
+        lower.axhline(told_pct, color="0.3", linestyle="--", label=f"{told_pct:g} %")
+        lower.axvline(paper.SENSITIVITY_N, color="0.6", linestyle=":", label="upper bound stated in the paper")
+        # 50 % is chance level.
+        lower.set(xscale="log", xlabel="weight difference / N", ylabel="correctly ordered pairs / %", ylim=(48, 102))
+        lower.legend(loc="lower right", frameon=True, framealpha=1, edgecolor="none")
         return {"sensitivity.svg": svg(figure)}

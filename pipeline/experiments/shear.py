@@ -99,20 +99,18 @@ FORCES = ("Fx", "Fy", "Fz")
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot predicted against true force for held-out lines, one panel per force component."""
-    with drawing(7.6, 3.1) as figure:
-        panels = figure.subplots(1, len(FORCES))
+    with drawing(4.6, f"Forces on held-out dragged lines ({source})") as figure:
+        *panels, last = figure.subplots(2, 2).ravel()
         for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):
-            low, high = min(*true_N, *predicted_N), max(*true_N, *predicted_N)
-            axes.plot([low, high], [low, high], color=COLOURS[0], linewidth=0.8)
+            ends_N = min(*true_N, *predicted_N), max(*true_N, *predicted_N)
+            axes.plot(ends_N, ends_N, color="0.3", marker="", linewidth=0.8)
             axes.scatter(true_N, predicted_N, s=7, color=COLOURS[1], alpha=0.6, linewidths=0)
             axes.set(xlabel=f"true {name} / N", ylabel=f"predicted {name} / N")
             axes.locator_params(nbins=4)
         explained = {part: _show_explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
-        title = (
-            f"Forces on held-out dragged lines ({source}); points: first of {numbers['seeds_n']} network seeds\n"
-            f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
-        )
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        text = f"explained variance\nsideways: {explained['fxy']}\nnormal: {explained['fz']}"
+        last.text(0, 0.9, f"{text}\n\npoints: first of\n{numbers['seeds_n']} network seeds", va="top", fontsize=8.5)
+        last.axis("off")
         return {"shear.svg": svg(figure)}
 
 

@@ -221,23 +221,18 @@ def draw_errors(
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw a map of the skin: every tested poke, coloured by its error, with chips and borders between boards."""
-    with drawing(4.7, 6.6) as figure:
+    with drawing(6.6, f"Place errors of held-out pokes over {numbers['chips_n']} chips ({source})") as figure:
         axes = figure.subplots()
+        axes.grid(visible=False)
         _draw_boards(axes, drawn)
-        most_mm = numbers["p95_error_mm"]["mean"]
-        size = float(np.clip(12_000 / len(drawn["x_mm"]), 10, 60))
-        points = axes.scatter(
-            drawn["x_mm"], drawn["y_mm"], c=drawn["error_mm"], s=size, cmap=ERROR_COLOURS, vmin=0.0, vmax=most_mm,
-            edgecolors="white", linewidths=0.3, zorder=3,
-        )  # fmt: skip
-        bar = figure.colorbar(points, label="place error, first seed / mm", extend="max", shrink=0.8)
-        bar.ax.tick_params(labelsize=9)
+        size, most_mm = np.clip(12_000 / len(drawn["x_mm"]), 10, 60), numbers["p95_error_mm"]["mean"]
+        look = {"cmap": ERROR_COLOURS, "vmin": 0.0, "vmax": most_mm, "linewidths": 0, "zorder": 3}
+        points = axes.scatter(drawn["x_mm"], drawn["y_mm"], c=drawn["error_mm"], s=size, **look)
+        figure.colorbar(points, label="place error, first seed / mm", extend="max", shrink=0.8)
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        median = show(numbers["median_error_mm"])
-        over = f"over {numbers['median_error_mm']['n']} network seeds"
-        title = f"Place errors of held-out pokes over {numbers['chips_n']} chips ({source})\nmedian {median} mm {over}"
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+        median = numbers["median_error_mm"]
+        axes.set_title(f"median {show(median)} mm over {median['n']} network seeds")
+        figure.legend(loc="outside lower left", ncols=3)
         return {"sleeve.svg": svg(figure)}
 
 
@@ -246,9 +241,8 @@ def _draw_boards(axes: Any, drawn: Mapping[str, Any]) -> None:
     thin = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
     axes.vlines(drawn["borders_x_mm"], 0, y_mm, **thin, label="border between boards")
     axes.hlines(drawn["borders_y_mm"], 0, x_mm, **thin)
-    axes.plot([0, x_mm, x_mm, 0, 0], [0, 0, y_mm, y_mm, 0], color=COLOURS[0], linewidth=1.2, label="edge of the skin")
+    axes.plot([0, x_mm, x_mm, 0, 0], [0, 0, y_mm, y_mm, 0], color=COLOURS[0], marker="", label="edge of the skin")
     chips = {"marker": "+", "s": 45, "color": COLOURS[2], "linewidths": 1.2, "zorder": 4, "label": "chip"}
     axes.scatter(drawn["chips_x_mm"], drawn["chips_y_mm"], **chips)
     axes.set(xlim=(-1.5, x_mm + 1.5), ylim=(-1.5, y_mm + 1.5))
-    for side in ("left", "bottom"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["left", "bottom"]].set_visible(False)

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pipeline.description import pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from reskin import io
 from reskin.config import Strict
@@ -192,49 +192,42 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
     import matplotlib as mpl
 
-    most_n = max(place["time"]["contacts_n"][-1] for place in places)
-    title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
-    with _panels(places, title, "field minus first visit / µT") as (figure, panels):
-        # The upper 15 % of the colour map are left out, because yellow is hard to see on white.
-        colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
-        scale = mpl.colors.Normalize(0, most_n)
+    # The upper 15 % of the colour map are left out, because yellow is hard to see on white.
+    colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
+    scale = mpl.colors.Normalize(0, max(place["time"]["contacts_n"][-1] for place in places))
+    title = f"Field over time at {numbers['depth_mm']:g} mm depth ({source})"
+    with _panels(places, title, "minus first visit / µT") as (figure, panels):
         for axes, place in zip(panels, places, strict=True):
             for contacts_n, line_uT in zip(place["time"]["contacts_n"], place["time"]["b_uT"], strict=True):
-                name = f"{contacts_n:,} contacts before"
-                axes.plot(line_uT, color=colours(scale(contacts_n)), linewidth=0.9, label=name)
+                axes.plot(line_uT, color=colours(scale(contacts_n)), marker="")
             _name_channels(axes, len(place["time"]["b_uT"][0]))
-        figure.colorbar(mpl.cm.ScalarMappable(scale, colours), ax=panels, label="contacts before", shrink=0.8)
+        bar = {"location": "bottom", "aspect": 50, "label": "contacts before"}
+        figure.colorbar(mpl.cm.ScalarMappable(scale, colours), ax=panels, **bar)
         return svg(figure)
 
 
 def _draw_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], source: str) -> str:
-    title = f"Mean change of field on several skins at {numbers['depth_mm']:g} mm depth ({source})"
+    title = f"Field of several skins at {numbers['depth_mm']:g} mm depth ({source})"
     with _panels(places, title, "change of field / µT") as (figure, panels):
         for axes, place in zip(panels, places, strict=True):
-            for i, (skin, line_uT) in enumerate(place["skins"].items()):
-                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
-                axes.plot(line_uT, label=skin, linewidth=1, **style)
+            for skin, line_uT in place["skins"].items():
+                axes.plot(line_uT, label=skin)
             _name_channels(axes, len(line_uT))
-        names = panels[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=5, frameon=False, title="skin")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower left", ncols=4)
         return svg(figure)
 
 
 @contextmanager
 def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Iterator[tuple[Any, Any]]:
     """Yield a figure with one panel per place, arranged in a column."""
-    with drawing(7.2, 0.8 + 2.5 * len(places)) as figure:
-        panels = figure.subplots(len(places), 1, squeeze=False)[:, 0]
+    with drawing(1.2 + 1.6 * len(places), title) as figure:
+        panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
         for axes, place in zip(panels, places, strict=True):
-            axes.set_title(f"at x = {place['x_mm']:g} mm, y = {place['y_mm']:g} mm", loc="left", fontsize=10)
-            axes.set_ylabel(ylabel)
-            axes.axhline(0, color="0.7", linewidth=0.8)
-            axes.grid(alpha=0.25)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+            axes.set(title=f"at x = {place['x_mm']:g} mm, y = {place['y_mm']:g} mm", ylabel=ylabel)
         yield figure, panels
 
 
 def _name_channels(axes: Any, channels_n: int) -> None:
     """Label the ticks of the x axis with the names of the channels: Bx0 is Bx of chip 0."""
     names = [f"B{'xyz'[i % 3]}{i // 3}" for i in range(channels_n)]
-    axes.set_xticks(range(channels_n), names, rotation=90 if channels_n > 15 else 0)
+    axes.set_xticks(range(channels_n), names, rotation=90)

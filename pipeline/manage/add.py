@@ -25,7 +25,6 @@ from pipeline.manage.registry import (
     without_capture,
     write_registry,
 )
-from pipeline.manage.running import require_idle
 from pipeline.plan import read_plan, use
 from pipeline.scenes import Scene, read_scene, read_shared, scene_file
 from pipeline.settings import Settings, read_settings
@@ -47,7 +46,6 @@ COMPARED_N = 3  # the places of a new capture are compared with those of this nu
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
     """Check and write a prepared recording, track it with DVC, and register it; on failure, undo all of this."""
-    require_idle(root)
     header, files = prepared
     copy = f"cp {SCENES}/ini.yaml {SCENES}/{scene}.yaml"
     remedy = f"To create it, run reskin new {scene} --boards ..., or copy a scene: {copy}."

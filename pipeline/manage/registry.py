@@ -3,16 +3,15 @@
 For each scene, it lists the names, the layout and the fingerprints of the captures (recorded files) of the scene.
 """
 
+import json
 from pathlib import Path
-
-from ruamel.yaml import YAML
 
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, did_you_mean
 
 REGISTRY = "data/captures.yaml"
-COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`.\n"
+COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`."
 
 
 class Entry(Strict):
@@ -35,8 +34,22 @@ class Registry(Strict):
 
 
 def read_registry(root: Path) -> Registry:
-    """Read and check `data/captures.yaml`."""
-    return parse(Registry, read_yaml(root / REGISTRY), str(root / REGISTRY))
+    """Read `data/captures.yaml`; raise `CaptureError` if captures contradict each other, for example after a merge."""
+    registry = parse(Registry, read_yaml(root / REGISTRY), str(root / REGISTRY))
+    for scene, captures in registry.captures.items():
+        boards: dict[str, str] = {}
+        seen: set[str] = set()
+        for name, entry in captures.items():
+            what = ""
+            if boards.setdefault(entry.skin, entry.board) != entry.board:
+                what = f"skin {entry.skin} is on two boards, {boards[entry.skin]} and {entry.board}"
+            elif entry.copy_of is None and seen.intersection(entry.fingerprints):
+                what = f"capture {name} has the same readings as another capture"
+            if what:
+                remedy = "Delete the line of the wrong capture, and add its recording again correctly."
+                raise CaptureError(f"{root / REGISTRY}: in scene {scene}, {what}. {remedy}")
+            seen.update(entry.fingerprints)
+    return registry
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
@@ -81,11 +94,12 @@ def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
 
 
 def write_registry(root: Path, registry: Registry) -> None:
-    """Write `data/captures.yaml`."""
-    yaml = YAML()
-    with io.replacing(root / REGISTRY) as temporary, temporary.open("w", encoding="utf-8") as stream:
-        stream.write(COMMENT)
-        yaml.dump(registry.model_dump(mode="json"), stream)
+    """Write `data/captures.yaml`, with one line for each capture, so that git merges the captures of two branches."""
+    lines = [COMMENT, "captures:" if registry.captures else "captures: {}"]
+    for scene, captures in registry.model_dump(mode="json")["captures"].items():
+        lines.append(f"  {json.dumps(scene)}:")
+        lines += [f"    {json.dumps(name)}: {json.dumps(entry)}" for name, entry in captures.items()]
+    io.write_text(root / REGISTRY, "\n".join(lines) + "\n")
 
 
 def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_copy: bool) -> None:

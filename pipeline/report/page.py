@@ -1,505 +1,180 @@
-"""The report page of a scene, and the page of all scenes."""
+"""Fill the pages of a report: templates in Markdown that people wrote (folder `pages`), with numbers of a run.
+
+A template is Jinja and Markdown. Besides the numbers of the scene (`numbers`, as in numbers.json) it can use the
+tables and figures of the scene, the paper's numbers (`paper`), and the functions and filters of `Page`. A name that
+does not exist is an error, so a page never shows an empty place.
+"""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
-from itertools import takewhile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup, escape
-from pydantic import Field
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, TemplateError
+from markdown_it import MarkdownIt
+from markupsafe import Markup
 
-from pipeline.catalogue import is_stage, module_name
-from pipeline.formatting import notes
-from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
-from pipeline.report.checklist import CLAIM, ONE_SKIN
-from pipeline.report.figures import HEADLINE
-from pipeline.report.protocol import Protocol, protocols
-from pipeline.report.sentences import sentences
-from pipeline.report.tables import run_tables
-from reskin.code import ROOT, file_of
-from reskin.config import Strict, parse, read_yaml
+from pipeline import paper
+from pipeline.formatting import show
+from pipeline.report.figures import unseen_rows
+from pipeline.statistics import Stat
 from reskin.errors import SchemaError
 
-Captions = dict[str, str]  # captions by the name of the table or figure
-PAGE_FILE = Path(__file__).with_name("page.yaml")
-PLACES_FILE = Path(__file__).with_name("page.places.yaml")
-SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that names the table or figure of a result
-SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
-SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
-FURTHER = "further"  # key of the section of tables and figures that no other section names
-# Tables that are unfolded when the page loads; all other tables are folded.
-OPEN = {"table1", "table2", "claims", "final_model"}
-WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
-BESIDE_N = 4  # a section compares at most this many results with the paper; the checklist contains all results
-EFFORTS = "Scores on new skins, by model and by the data that the model needs from the new skin"
-SOURCES = {
-    "simulated": "Every reading of this scene was simulated, so no number on this page was measured on hardware.",
-    "recorded": "Every capture of this scene was recorded from hardware. Results of simulated readings are marked.",
-}
-RESULTS = ("table-2", "figure-")  # the ids of those tables and figures of the paper that show results start with these
-KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-UNIT = r" (%|mm²|N²|mm|N|Hz|µT)(?!\w)"
-# Places where no line break is allowed: between a number and its deviation or unit, and in an interval with its unit.
-UNBROKEN = re.compile(rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]({UNIT})?")
-SENTENCE_END = re.compile(r"(?<=[.]) ")
-NO_BREAK = "\u00a0"
-NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-LONG = 40  # a column with a cell of more characters than this is wide
-NO_VALUE = ("–", "")  # cells that are hidden if the rows of a table are stacked
-# Widths in rem, which estimate the width of a table. If a table is wider than its place on the screen, its rows are
-# stacked, with the cells of each row below each other.
-STEPS_REM = (18, 22, 26, 30, 36, 42, 48, 54, 60, 65, 70, 76, 90, 110, 140)
-CHARACTER_REM, PADDING_REM = 0.52, 1.0  # width of a character, and of the padding of a cell
-SHORT_LINE, LONG_LINE = 14, 20  # characters in a line of a wrapped cell, for short cells and for long cells
-SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
-LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; in these files, 1 px means 1 pt
-PX_PER_PT = 4 / 3
-WIDE_PT = 500.0  # a wider figure gets its own row
-LEGIBLE_PX = 8.0  # size of the smallest legible letters; a figure scrolls instead of shrinking further
-NARROW_PX = 340.0  # width of a phone's screen
+FOLDER = Path(__file__).with_name("pages")
+TEMPLATES = {"simulated": "simulated.md", "recorded": "recorded.md"}  # the page of a scene, by its source
+# A cell of a table that is a number, perhaps with a unit, a deviation, an interval or values of boards.
+NUMBER = re.compile(r"[-+−≤<]?\s?\d[\d.,e+-]*( [%a-zA-Zµ²°]{1,3})?( ± [\d.e+-]+)?( (\(.*\)|\[.*\]))?|–?")
+ID = re.compile(r'(\bid="|url\(#|href="#)')  # where an SVG defines or uses an id
 
 
-class Place(Strict):
-    """A table or figure of the paper: its name, what it shows, and our tables and figures that show the same."""
+class Page:
+    """One page: renders a template, and remembers which tables and figures of the scene the template placed.
 
-    id: str
-    name: str
-    what: str
-    shown: tuple[str, ...] = ()
-
-
-class Section(Strict):
-    """A section of the page: heading, introductory sentence, and the captions of its tables and figures, in order."""
-
-    key: str
-    title: str
-    sentence: str
-    tables: Captions = Field(default_factory=dict)
-    figures: Captions = Field(default_factory=dict)
-    folded: Captions = Field(default_factory=dict)  # long tables, which come last
-
-    @property
-    def captions(self) -> Captions:
-        """The captions of everything that the section shows, by name."""
-        return self.tables | self.figures | self.folded
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure on the page: its file, its size, and the width below which its letters become illegible."""
-
-    id: str
-    file: str
-    width_px: int
-    height_px: int
-    least_px: int
-    wide: bool
-    sentence: str = ""  # what the figure shows, or what to look for
-
-    @property
-    def scrolls(self) -> bool:
-        """Whether the figure scrolls on a phone, because its letters are illegible at the width of the screen."""
-        return self.least_px > NARROW_PX
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table on the page; `looks` has the style of each column: `number` (aligned right), `text` or `text long`.
-
-    If the table's place on the screen is narrower than `width_rem`, the rows of the table are stacked.
+    - numbers: content of numbers.json.
+    - tables: tables by name.
+    - figures: SVG text by name, without the suffix.
     """
 
-    id: str
-    name: str
-    caption: str
-    columns: list[str]
-    looks: list[str]
-    rows: Sequence[tuple[str, ...]]
-    notes: list[str]
-    width_rem: int
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A scene on the page of all scenes: name, description, counts of captures, answers and headline figure.
-
-    `places` lists the tables and figures of the paper whose results are also shown on the page of this scene.
-    """
-
-    scene: str
-    about: str
-    counts: str
-    answers: Answers
-    efforts: Table | None
-    figure: Drawing | None
-    places: list[dict[str, Any]]
-
-
-def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name.
-
-    Tables without rows are not shown.
-    """
-    tables = {name: table for name, table in tables.items() if len(table)}
-    source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
-    drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
-    drawings = describe(drawings, sentences(numbers))
-    checklist = tables.get("checklist", pd.DataFrame())
-    answered, ran = answers(numbers), protocols(numbers)
-    sections = arrange(tables, drawings)
-    return template("page.html").render(
-        scene=numbers["provenance"]["scene"],
-        source=source,
-        about=about(numbers),
-        answers=answered,
-        efforts=efforts_table("efforts", answered),
-        levels=LEVELS,
-        brackets=IN_BRACKETS,
-        places=[place_on_page(place, ids) for place in read_places()],
-        sections=[
-            _fill(section, tables, drawings, source, ids)
-            | {
-                "beside": beside_paper(section, checklist, ids),
-                "stages": stages_of(section, checklist),
-                "ran": _ran(section, ran),
-            }
-            for section in sections
-        ],
-        saved=[*tables],
-        opened=OPEN,
-    )
-
-
-def read_places() -> list[Place]:
-    """Read the tables and figures of the paper, in its order."""
-    return [parse(Place, entry, f"places, entry {entry['id']}") for entry in read_yaml(PLACES_FILE)]
-
-
-def ids_of(names: Iterable[str]) -> dict[str, str]:
-    """Return the id of each table and figure on a page; the paper's name is the id of those that the paper also has."""
-    papers: dict[str, str] = {}
-    shown = list(names)
-    for place in read_places():
-        if name := next((name for name in place.shown if name in shown), None):
-            papers[name] = place.id
-    own = {name: f"{name.removesuffix('.svg')}-{'figure' if name.endswith('.svg') else 'table'}" for name in shown}
-    return own | papers
-
-
-def place_on_page(place: Place, ids: Mapping[str, str]) -> dict[str, Any]:
-    """Return a table or figure of the paper, and whether the page shows it."""
-    return {"id": place.id, "name": place.name, "what": place.what, "here": place.id in ids.values()}
-
-
-def _ran(section: Section, ran: Sequence[Protocol]) -> list[Protocol]:
-    return [protocol for protocol in ran if protocol.section == section.key]
-
-
-def efforts_table(name: str, answered: Answers) -> Table | None:
-    """Tabulate the scores behind the answers of a scene; None if no board was held out."""
-    cells = [effort.cells for effort in answered.efforts]
-    return lay_out(name, EFFORTS, pd.DataFrame(cells)) if cells else None
-
-
-def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
-    """Render the page of one run (commit, machine, versions, times), to which the scene's page links.
-
-    numbers: numbers.json joined with provenance.json. costs: texts of the other files in the folder of the page, by
-    file name.
-    """
-    source = numbers["provenance"]["source"]
-    tables = run_tables(numbers, source)
-    ids = ids_of([*tables, *costs])
-    drawings = {name: measure(name, text, ids[name]) for name, text in costs.items() if name.endswith(".svg")}
-    drawings = describe(drawings, sentences(numbers))
-    provenance = pd.DataFrame(
-        {
-            "what": key,
-            "value": ", ".join(f"{name} {version}" for name, version in value.items())
-            if isinstance(value, Mapping)
-            else value,
+    def __init__(
+        self,
+        numbers: Mapping[str, Any],
+        tables: Mapping[str, pd.DataFrame] | None = None,
+        figures: Mapping[str, str] | None = None,
+    ) -> None:
+        self.numbers, self.tables, self.figures = numbers, dict(tables or {}), dict(figures or {})
+        self.placed: set[str] = set()
+        self.parts: list[str] = []  # HTML of tables and figures, which Markdown must not change
+        self.environment = Environment(
+            loader=FileSystemLoader(FOLDER), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+            keep_trailing_newline=True,
+        )  # fmt: skip
+        self.environment.filters |= {
+            "show": show,
+            "fixed": fixed,
+            "compact": compact,
+            "rms": lambda stat: stat["mean"] ** 0.5,
         }
-        for key, value in numbers["provenance"].items()
-    )
-    return template("page.run.html").render(
-        scene=numbers["provenance"]["scene"],
-        source=source,
-        provenance=lay_out("provenance", "Provenance", provenance),
-        sections=[_fill(section, tables, drawings, source, ids) for section in arrange(tables, drawings)],
-    )
+        self.environment.globals |= {
+            "paper": paper, "numbers": numbers, "tables": self.tables, "figures": self.figures, "table": self.table,
+            "folded": self.folded, "figure": self.figure, "pick": pick, "unseen": self.unseen,
+            "further_tables": lambda: [name for name in self.tables if name not in self.placed],
+            "further_figures": lambda: [name for name in self.figures if name not in self.placed],
+        }  # fmt: skip
+        self.html = Environment(loader=FileSystemLoader(FOLDER), autoescape=True, undefined=StrictUndefined)
 
+    def fill(self, template: str, **context: Any) -> str:
+        """Fill a template; raise `SchemaError`, with the line, if it uses a name that does not exist."""
+        try:
+            return self.environment.get_template(template).render(**context)
+        except (TemplateError, KeyError, TypeError) as error:
+            line = _line_of(error, template)
+            raise SchemaError(
+                f"pipeline/report/pages/{template}{line}: {type(error).__name__}: {error}. Correct the "
+                "template; it can use what numbers.json of the scene has."
+            ) from error
 
-def index(
-    results: Sequence[Mapping[str, Any]],
-    headlines: Mapping[str, str],
-    described: Mapping[str, str] | None = None,
-    shown: Mapping[str, Sequence[str]] | None = None,
-) -> str:
-    """Render the page of all scenes, with recorded scenes first.
-
-    headlines: headline figures by scene. described: descriptions by scene. shown: names of tables and figures by scene.
-    """
-    kinds = []
-    for source, title in KINDS.items():
-        entries = [
-            _entry(numbers, headlines, described or {}, shown or {})
-            for numbers in results
-            if numbers["provenance"]["source"] == source
-        ]
-        if entries:
-            # Scenes that are tested on held-out boards come first.
-            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))
-            kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
-    return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
-
-
-def _entry(
-    numbers: Mapping[str, Any],
-    headlines: Mapping[str, str],
-    described: Mapping[str, str],
-    shown: Mapping[str, Sequence[str]],
-) -> Entry:
-    scene, answered = str(numbers["provenance"]["scene"]), answers(numbers)
-    figure = None
-    if scene in headlines:
-        figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene], f"{scene}-figure")
-    efforts = efforts_table(f"efforts-{scene}", answered)
-    ids = ids_of(shown.get(scene, ()))
-    places = [place_on_page(place, ids) for place in read_places() if place.id.startswith(RESULTS)]
-    here = [place for place in places if place["here"]]
-    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure, here)
-
-
-def about_scene(text: str) -> str:
-    """Return the description of a scene: the first sentence of the comment at the top of its YAML file.
-
-    >>> about_scene("# Scene ini: two boards, pressed\\n# by a printer. One is new.\\nsource: recorded")
-    'Two boards, pressed by a printer.'
-    """
-    lines = takewhile(lambda line: line.startswith("#"), text.splitlines())
-    comment = " ".join(line.lstrip("# ") for line in lines)
-    sentence = re.sub(r"^Scene \w+(, [^:]*)?:? ", "", SENTENCE_END.split(comment)[0])
-    return sentence[:1].upper() + sentence[1:]
-
-
-def template(name: str) -> Template:
-    """Load a Jinja template from the folder of this module."""
-    environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
-    environment.tests["number_text"] = NUMBER.fullmatch
-    environment.tests["no_value"] = lambda cell: cell in NO_VALUE
-    environment.filters["unbroken"] = unbroken
-    environment.filters["code"] = show_code
-    environment.globals["steps_rem"] = STEPS_REM
-    return environment.get_template(name)
-
-
-def show_code(text: str) -> Markup:
-    """Mark what is between backquotes as code."""
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
-
-
-def unbroken(text: str) -> str:
-    """Use non-breaking spaces between a number and its deviation or unit, and within an interval and its unit."""
-    if isinstance(text, Markup):
-        return text
-    return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)
-
-
-def read_sections() -> list[Section]:
-    """Read the sections of the page, in order."""
-    return [parse(Section, entry, f"page, section {entry['key']}") for entry in read_yaml(PAGE_FILE)]
-
-
-def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
-    """List the sections to show; section `further` has the tables and figures that no other section names."""
-    sections, names = read_sections(), {"tables": dict.fromkeys(tables), "figures": dict.fromkeys(figures)}
-    named = {name for section in sections for name in section.captions}
-    further = {kind: {name: _title(name) for name in of_kind if name not in named} for kind, of_kind in names.items()}
-    filled = [section.model_copy(update=further) if section.key == FURTHER else section for section in sections]
-    return [section for section in filled if section.captions.keys() & {*names["tables"], *names["figures"]}]
-
-
-def _title(name: str) -> str:
-    text = name.removesuffix(".svg").replace("_", " ")
-    return text[:1].upper() + text[1:]
-
-
-def about(numbers: Mapping[str, Any]) -> str:
-    """Describe where the readings of a scene come from, and how many there are."""
-    return f"{SOURCES[numbers['provenance']['source']]} {counts_of(numbers)}"
-
-
-def counts_of(numbers: Mapping[str, Any]) -> str:
-    """List the counts of the main captures."""
-    counts = dict(next(iter(numbers["described"].values()))["counts"])
-    captures_n = counts.pop("captures_n")
-    listed = " and ".join(f"{n:,} {name.removesuffix('_n').replace('_', ' ')}" for name, n in counts.items() if n)
-    return f"Main captures: {captures_n:,}, with {listed}."
-
-
-def beside_paper(section: Section, checklist: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table | None:
-    """Tabulate the checklist rows of a section that contain a number of this scene; rows with verdicts come first."""
-    rows = [row for row in _rows_of(section, checklist) if _has_number(row["ours"]) and row["note"] != ONE_SKIN]
-    if not rows:
-        return None
-    rows.sort(key=lambda row: (not row["result"].startswith(CLAIM), row["verdict"] in NO_VALUE))
-    columns = ["result", "ours", "paper", "verdict", "note"]
-    return lay_out(f"beside-{section.key}", "Comparison with the paper", pd.DataFrame(rows[:BESIDE_N])[columns], ids)
-
-
-def _has_number(cell: str) -> bool:
-    return cell not in NO_VALUE and not cell.startswith(SEE)
-
-
-def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
-    """List the stages whose results a section shows, each with the file that contains the code of the stage."""
-    stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
-    return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
-
-
-def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
-    """Select the checklist rows whose tables or figures the section shows."""
-    if section.key in WHOLE or checklist.empty:
-        return []
-    cells = checklist.astype(str)
-    rows = (dict(zip(cells.columns, row, strict=True)) for row in cells.itertuples(index=False))
-    return [row for row in rows if section.captions.keys() & set(row["shown in"].split(", "))]
-
-
-def measure(file: str, svg: str, id: str) -> Drawing:
-    """Read the size of a figure from its SVG text, and compute the smallest legible width, in CSS pixels."""
-    size = SVG_SIZE_PT.search(svg)
-    if size is None:
-        raise SchemaError(
-            f"{file}: the SVG has no size in points; it starts with {svg[:80]}. Write figures with function `svg` of "
-            "pipeline/plot.py."
+    def html_of(self, template: str, title: str, **context: Any) -> str:
+        """Fill a template and return the whole page as HTML, with its style and its figures inside."""
+        body = MarkdownIt("commonmark", {"html": True}).enable("table").render(self.fill(template, **context))
+        body = re.sub(r"(?:<p>)?\x02(\d+)\x03(?:</p>)?", lambda match: self.parts[int(match[1])], body)
+        style = (FOLDER / "style.css").read_text(encoding="utf-8")
+        return (
+            self.html.get_template("base.html").render(title=title, style=Markup(style), body=Markup(body)).strip()
+            + "\n"
         )
-    width_pt, height_pt = map(float, size.groups())
-    smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)
-    least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt
-    width_px, height_px = (round(PX_PER_PT * side_pt) for side_pt in (width_pt, height_pt))
-    return Drawing(id, file, width_px, height_px, round(least_px), width_pt > WIDE_PT)
+
+    def table(self, name: str) -> str:
+        """Place a table of the scene."""
+        self.placed.add(name)
+        number = NUMBER.fullmatch
+        cells = self.tables[name].map(lambda cell: "–" if pd.isna(cell) else str(cell))
+        return self._part(self._macro("table")(name, cells, number))
+
+    def folded(self, name: str, title: str) -> str:
+        """Place a table of the scene below a line that unfolds it; nothing if the scene has no such table."""
+        if name not in self.tables:
+            return ""
+        rows_n = len(self.tables[name])
+        part = self.parts[int(self.table(name).strip("\x02\x03\n"))]
+        return self._part(f"<details><summary>{title} ({rows_n} row{'s' * (rows_n > 1)})</summary>{part}</details>")
+
+    def figure(self, name: str, caption: str) -> str:
+        """Place a figure of the scene inside the page; its ids get the name of the figure, so that they stay unique."""
+        self.placed.add(name)
+        svg = re.sub(r"^.*?(?=<svg)", "", self.figures[name], flags=re.DOTALL)
+        return self._part(self._macro("figure")(name, Markup(ID.sub(rf"\1{name}-", svg)), Markup(caption)))
+
+    def unseen(self, method: str, labels_n: int) -> Mapping[str, Any]:
+        """Return the scores of a method on boards never seen in training, on the checkerboard, with all its presses."""
+        return pick(unseen_rows(self.numbers, (method,)), labels_n=labels_n)
+
+    def _macro(self, name: str) -> Any:
+        return getattr(self.html.get_template("parts.html").module, name)
+
+    def _part(self, html: str) -> str:
+        self.parts.append(str(html))
+        return f"\x02{len(self.parts) - 1}\x03"
 
 
-def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
-    """Add to each drawing the sentence that tells readers what they can see in it.
+def fixed(value: float, digits: int = 0) -> str:
+    """Write a number with so many decimals.
 
-    `by_name` contains these sentences by name of the drawing. Drawings without a sentence are not changed.
+    >>> fixed(78.7), fixed(0.4449, 2)
+    ('79', '0.44')
     """
-    return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
+    return f"{value:z,.{digits}f}"
 
 
-def lay_out(name: str, caption: str, table: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table:
-    """Prepare a table for the page: how its columns look, its cells as text, its notes and its width.
+def compact(value: Mapping[str, Any], digits: int = 0) -> str:
+    """Write a mean with so many decimals, and the interval over boards, the values of the boards, or a deviation.
 
-    If column `source` has a single value, the value is moved to the caption. In tables with verdicts, the columns that
-    explain the verdict are joined. `ids` contains the ids of the tables and figures on the page, to which cells link.
+    >>> compact({"mean": 43.3, "n": 2, "values": [45.1, 41.4]}), compact({"mean": 46.6, "n": 27, "sd": 20.2})
+    ('43 (45; 41)', '47 ± 20')
     """
-    cells = table.fillna("")
-    if "source" in cells and cells["source"].nunique() == 1:
-        caption = f"{caption} ({cells['source'].iloc[0]})"
-        cells = cells.drop(columns="source")
-    if "criterion" in cells:
-        cells = _explain_verdicts(cells)
-    cells = cells.astype(str)
-    shown_in = [cell.split(", ")[0] for cell in cells.pop(SHOWN_IN)] if SHOWN_IN in cells else [""] * len(cells)
-    looks = [_look(cells[title]) for title in cells.columns]
-    rows = [*cells.itertuples(index=False, name=None)]
-    columns = [*map(str, cells.columns)]
-    width_rem = _width_rem(columns, rows)
-    if "ours" in columns:
-        i, ids = columns.index("ours"), ids or {}
-        rows = [(*row[:i], link(row[i], shown, ids), *row[i + 1 :]) for row, shown in zip(rows, shown_in, strict=True)]
-    return Table((ids or {}).get(name, name), name, caption, columns, looks, rows, notes(table), width_rem)
+    stat = Stat.of(value)
+    mean, *others = [fixed(number, digits) for number in (stat.mean, *stat.ends)]
+    if others:
+        return f"{mean} ({'; '.join(others)})" if stat.few else f"{mean} [{', '.join(others)}]"
+    return mean if stat.sd is None else f"{mean} ± {fixed(stat.sd, digits)}"
 
 
-def link(result: str, shown_in: str, ids: Mapping[str, str]) -> str:
-    """Link a result of the checklist to the table or figure of the page that shows it, if the page has it."""
-    seen = SEEN.fullmatch(result)
-    name = seen["name"] + ".svg" * (seen["kind"] == "figure") if seen else shown_in
-    if name not in ids or result in NO_VALUE:
-        return result
-    text = f"{SEE}{_in_words(name)}" if seen else unbroken(result)
-    return Markup(f'<a href="#{ids[name]}">{escape(text)}</a>')
+def pick(rows: Sequence[Mapping[str, Any]], **keys: Any) -> Mapping[str, Any]:
+    """Return the only row with these values; raise `SchemaError` if there is none, or more than one."""
+    found = [row for row in rows if all(row.get(key) == value for key, value in keys.items())]
+    if len(found) != 1:
+        raise SchemaError(f"{len(found)} rows of numbers.json have {keys}; expected one. Correct the template.")
+    return found[0]
 
 
-@cache
-def _in_words(name: str) -> str:
-    """Name a table or figure in a sentence: as the paper does, if it shows one of the paper's, or by its caption."""
-    for place in read_places():
-        if name in place.shown and place.id.startswith(("table-", "figure-")):
-            return place.id.replace("-", " ")
-    captions = {key: text for section in read_sections() for key, text in section.captions.items()}
-    caption = re.split("[:,] ", captions.get(name, _title(name)))[0]
-    return caption[:1].lower() + caption[1:]
+def scene_page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
+    """Render the page of a scene, which is equal for all repeats of a run; tables without rows are not shown."""
+    scene, source = (numbers["provenance"][name] for name in ("scene", "source"))
+    shown = {name: table for name, table in tables.items() if len(table)}
+    named = {name.removesuffix(".svg"): svg for name, svg in figures.items()}
+    counts = next(iter(numbers["described"].values()))["counts"]
+    page = Page(numbers, shown, named)
+    return page.html_of(TEMPLATES[source], f"ReSkin: scene {scene} ({source})", scene=scene, counts=counts)
 
 
-def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
-    """Join the columns that explain a verdict: criterion, whether our mean meets it, p-value and notes."""
-    parts = {"criterion": "{criterion}: {met}", "p (Holm)": "p = {p (Holm)} (Holm)", "note": "{note}"}
-    why = [
-        "; ".join(text.format_map(row) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
-        for row in cells.to_dict("records")
-    ]
-    shown = cells.drop(columns=[*parts, "met", "paper in our interval", "stage"], errors="ignore")
-    position = list(shown.columns).index("verdict") + 1
-    shown.insert(position, "criterion and notes", why)
-    first = next(title for title in ("claim", "result") if title in shown)
-    return shown[[first, *(title for title in shown if title != first)]]
+def run_page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
+    """Render the page of one run: commit, machine, versions, times; numbers: joined with provenance.json."""
+    scene = numbers["provenance"]["scene"]
+    named = {name.removesuffix(".svg"): svg for name, svg in figures.items()}
+    return Page(numbers, tables, named).html_of("run.md", f"ReSkin: run of scene {scene}", scene=scene)
 
 
-def _width_rem(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> int:
-    """Estimate the smallest width, in rem, at which a table is easy to read without stacking its rows."""
-    width_rem = 0.0
-    for i, title in enumerate(columns):
-        cells = [row[i] for row in rows]
-        word = max(len(word) for text in (title, *map(unbroken, cells)) for word in text.split(" "))
-        cell = max(map(len, cells), default=0)
-        line = LONG_LINE if cell > LONG else SHORT_LINE
-        nowrap = max((len(text) for text in cells if NUMBER.fullmatch(text)), default=0)
-        width_rem += CHARACTER_REM * max(word, nowrap, min(cell, line)) + PADDING_REM
-    return next((step for step in STEPS_REM if step >= width_rem), STEPS_REM[-1])
+def index_page(results: Sequence[Mapping[str, Any]]) -> str:
+    """Render the page that lists all scenes; results: numbers.json of each scene."""
+    scenes = {source: [one for one in results if one["provenance"]["source"] == source] for source in TEMPLATES}
+    return Page({}).html_of("index.md", "ReSkin: all scenes", scenes=scenes, unseen_rows=unseen_rows)
 
 
-def _look(cells: "pd.Series[str]") -> str:
-    """Return the style of a column. Numbers with deviations are aligned left, like those with intervals."""
-    if all(NUMBER.fullmatch(cell) and "±" not in cell for cell in cells) and any(
-        cell not in NO_VALUE for cell in cells
-    ):
-        return "number"
-    return "text long" if cells.str.len().max() > LONG else "text"
-
-
-def _fill(
-    section: Section,
-    tables: Mapping[str, pd.DataFrame],
-    figures: Mapping[str, Drawing],
-    source: str,
-    ids: Mapping[str, str],
-) -> dict[str, Any]:
-    """Prepare a section for the template: heading, sentence, and the tables and figures that this report has."""
-    captions = section.tables | section.folded
-    return {
-        "key": section.key,
-        "title": section.title,
-        "sentence": section.sentence,
-        "tables": [lay_out(name, text, tables[name], ids) for name, text in captions.items() if name in tables],
-        "figures": [
-            (figures[name], _with_source(text, source)) for name, text in section.figures.items() if name in figures
-        ],
-    }
-
-
-def _with_source(caption: str, source: str) -> str:
-    """Append the source of the data to a caption, unless the caption itself names recorded and simulated data.
-
-    >>> _with_source("Forces on the recorded hand, and on simulated skins", "recorded")
-    'Forces on the recorded hand, and on simulated skins'
-    """
-    return caption if "recorded" in caption and "simulated" in caption else f"{caption} ({source})"
+def _line_of(error: BaseException, template: str) -> str:
+    """Return the line of the template in which an error arose, for messages; empty if unknown."""
+    trace, line = error.__traceback__, ""
+    while trace:
+        if trace.tb_frame.f_code.co_filename.endswith(template):
+            line = f", line {trace.tb_lineno}"
+        trace = trace.tb_next
+    return line or (f", line {error.lineno}" if hasattr(error, "lineno") else "")

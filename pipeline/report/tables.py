@@ -29,11 +29,10 @@ from pipeline.formatting import (
     to_markdown,
 )
 from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
-from pipeline.report.checklist import checklist, claims_table
+from pipeline.report.claims import NOT_RUN, NOT_TESTABLE, evaluate, read_claims
 from pipeline.report.experiments import experiment_tables
 from pipeline.report.figures import unseen_rows
 from pipeline.report.numbers import timed_rows
-from pipeline.report.protocol import protocol_table, protocols
 from pipeline.report.table_2 import Model, models, table_2_rows
 from pipeline.statistics import Stat
 from reskin.config import Strict, parse, read_yaml
@@ -235,14 +234,11 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     if "described" in numbers:
         columns = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
         tables["skins"] = skins_table(columns)
-    if protocols(numbers):
-        tables["protocol"] = protocol_table(numbers, source)
     tables["captures"] = _captures(numbers, source)
     if ours := measured(numbers):
         tables["table1"] = table1(read_table1(), ours)
-    tables["checklist"] = checklist(numbers)
-    claims = claims_table(tables["checklist"])
-    return tables if claims.empty else tables | {"claims": claims}
+    claims = evaluate(numbers, read_claims())
+    return tables if set(claims["verdict"]) <= {NOT_RUN, NOT_TESTABLE} else tables | {"claims": claims}
 
 
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:

@@ -1,31 +1,27 @@
-"""Stages that present results: table2, report (numbers, tables, figures, pages) and publish (MLflow)."""
+"""Stages that present results: table2, and report (numbers, tables, figures and pages)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from pipeline import PLAN, SCENES
-from pipeline.catalogue import EXPERIMENTS, stages
-from pipeline.executors import make_executor
+from pipeline import PLAN
+from pipeline.catalogue import stages
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded, to_markdown
 from pipeline.provenance import (
     COSTS,
     SECONDS,
     code_version,
-    home,
-    is_experiment,
     machine,
     read_costs,
     total_cost_s,
     versions,
 )
 from pipeline.report.experiments import experiment_figures, experiment_numbers
-from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
-from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
+from pipeline.report.figures import Outline, error_grids, score_figures
 from pipeline.report.numbers import (
     add_up,
     before_touch_numbers,
@@ -35,22 +31,15 @@ from pipeline.report.numbers import (
     lost_by_protocol,
     split,
     stage_costs,
-    sweep_curves,
     timed_rows,
 )
-from pipeline.report.page import about_scene, index, page, run_page
-from pipeline.report.summary import summarise
+from pipeline.report.page import index_page, run_page, scene_page
 from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
 from pipeline.scenes import TABLE_2, Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.statistics import as_json
-from pipeline.tracking import Curves, Results, TrackingUnavailable, metrics_of, publishing, read_times, scores_link
-from pipeline.tracking import publish as write_runs
 from pipeline.training.choice import choose, fingerprint, to_record
-from pipeline.training.final import EXPERIMENT as FINAL_EXPERIMENT
-from pipeline.training.final import FILE as FINAL_FILE
 from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
@@ -69,51 +58,57 @@ def table2(settings: Settings, scores: Path, tables: Path) -> None:
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
     numbers = rounded(numbers)
     text = to_markdown(table_2_summary(numbers))
-    io.write_texts(tables, {"table2.md": text, **headline_figures(numbers, source)})
+    io.write_texts(tables, {"table2.md": text, **score_figures(numbers, source)})
     say(f"{name} ({source})\n{text}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
 def report(
-    settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path, results: Path, reports: Path
-) -> None:
+    settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path, results: Path, reports: Path,
+    figures: Path,
+) -> None:  # fmt: skip
     """Write the numbers, tables, figures and the page of a scene."""
     name, scene = settings.scene, planned_scene(settings)
-    source, inputs = scene.source, read_inputs(name, scene, indentations, folds, models, results)
+    inputs = read_inputs(name, scene, indentations, folds, models, results)
     table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
     numbers = rounded(compute_numbers(settings, scene, inputs, table))
-    plot_data = {name: result["drawn"] for name, result in inputs.analyses.items()}
     if "choice" in scene.experiments:
         physics = fingerprint(settings.shared)
-        record = to_record(numbers["chosen"], inputs.cards, source=source, seed=settings.seed, physics=physics)
+        record = to_record(numbers["chosen"], inputs.cards, source=scene.source, seed=settings.seed, physics=physics)
         io.write_json(reports / "choice.json", record)
     shared, of_this_run = split(numbers)
     io.write_json(reports / "numbers.json", shared)
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
-    with make_executor(
-        imports="pipeline.report.experiments"
-    ) as executor:  # figures are drawn in parallel, because drawing takes most of the time
-        figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
-        tables = make_tables(numbers)
-        io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(table)})
-        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
-        of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
-        outline = None if of_layout is None else Outline(**of_layout)
-        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
-        figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
-        figures |= figures_future.result()
-    io.write_texts(reports / "figures", figures)
-    # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
-    timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, source)
-    of_run = table_texts(run_tables(numbers, source)) | timed
-    io.write_texts(reports / "runtime", of_run | {"index.html": run_page(numbers, timed)})
-    io.write_text(reports / "index.html", page(shared, tables, figures))
+    plot_data = {name: result["drawn"] for name, result in inputs.analyses.items()}
+    predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
+    drawn = draw(numbers, plot_data, predictions)
+    io.write_texts(figures, drawn)
+    tables = make_tables(numbers)
+    io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(table)})
+    io.write_text(reports / "index.html", scene_page(shared, tables, drawn))
+    # Seconds, commit and machine differ between equal runs, so this page is not an output of the DVC stage.
+    timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, scene.source)
+    io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers, scene.source), timed))
     write_index(reports.parent)
-    for line in (
-        *summarise(numbers),
-        f"{name}: open {reports}/index.html in a browser; numbers and tables are beside it",
-    ):
-        say(line)
+    say(f"{name}: {accuracies(numbers)}open {reports}/index.html in a browser; training runs: make ui")
+
+
+def accuracies(numbers: Mapping[str, Any]) -> str:
+    """Return the accuracies of table 2 as words for a message; an empty string if the scene does not have the table."""
+    means = [f"{name} {row['accuracy_pct']['mean']:.0f} %" for name, row in numbers.get("table2", {}).items()]
+    return f"places within 1 mm on boards not seen in training: {', '.join(means)}; " if means else ""
+
+
+def draw(numbers: dict[str, Any], plot_data: dict[str, Any], predictions: list[Any]) -> dict[str, str]:
+    """Draw all figures of a scene: SVG text by file name.
+
+    plot_data: data that only figures need, by key of numbers.json. predictions: predictions of networks, by stage.
+    """
+    source = numbers["provenance"]["source"]
+    of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
+    outline = None if of_layout is None else Outline(**of_layout)
+    figures = dict(error_grids(predictions, HEADLINE, source, outline))
+    return figures | score_figures(numbers, source) | experiment_figures(numbers, plot_data, source)
 
 
 @dataclass(frozen=True)
@@ -185,72 +180,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
 def write_index(reports: Path) -> None:
     """Write the page that lists all scenes with reports."""
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
-    files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
-    headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
-    settings = (Path(SCENES) / f"{numbers['provenance']['scene']}.yaml" for numbers in results)
-    about = {file.stem: about_scene(file.read_text(encoding="utf-8")) for file in settings if file.exists()}
-    folders = [file.parent for file in reports.glob("*/numbers.json")]
-    shown = {
-        folder.name: [
-            *(file.stem for file in folder.glob("tables/*.csv")),
-            *(file.name for file in folder.glob("figures/*.svg")),
-        ]
-        for folder in folders
-    }
-    listed = [numbers for numbers in results if "described" in numbers]
-    io.write_text(reports / "index.html", index(listed, headlines, about, shown))
-
-
-def publish(settings: Settings, indentations: Path, models: Path, scores: Path, results: Path, reports: Path) -> None:
-    """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
-    if not publishing():
-        return
-    scene, name = planned_scene(settings), settings.scene
-    # Results of `dvc exp` and results of the checkout are in different MLflow experiments.
-    experiment = f"{name} (dvc exp)" if is_experiment() else name
-    try:
-        found = published_results(scene, name, indentations, models, scores, results, reports)
-        say(write_scene(found, experiment, home(), register=not is_experiment()))
-    except TrackingUnavailable as error:
-        say(f"warning: the results of scene {name} were not written to MLflow: {error}")
-
-
-def published_results(
-    scene: Scene, name: str, indentations: Path, models: Path, scores: Path, results: Path, reports: Path
-) -> Results:
-    """Collect what the stages of a scene wrote, for MLflow."""
-    scores_file = reports / "scores.json"
-    table_2 = io.read_json(scores_file).get("table2", {}) if scores_file.exists() else {}
-    return Results(
-        models={stage: models / stage for stage in scene.model_stages},
-        curves=read_curves(scene, scores, results),
-        reports=reports,
-        scores={EXPERIMENTS[TABLE_2[row]].stage: means for row, means in table_2.items() if row in TABLE_2},
-        final=models / FINAL_EXPERIMENT / FINAL_FILE,
-        readings=sorted(indentations.glob("*.parquet")),
-        times=read_times(name),
-    )
-
-
-def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
-    """Write the runs of a scene that MLflow lacks; return a sentence with their number and their address."""
-    counts = write_runs(results, scene=experiment, root=root, register=register)
-    return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
-
-
-def read_curves(scene: Scene, scores: Path, results: Path) -> Curves:
-    """Read the results that MLflow shows as curves: the points of every sweep, and the numbers of every analysis.
-
-    The keys of the result are the names of the stages that computed the curves.
-    """
-    table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
-    curves: dict[str, list[tuple[str, int, dict[str, float]]]]
-    curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(table).items()}
-    analyses = {experiment: io.read_json(results / f"{experiment}.json") for experiment in scene.analyses}
-    for experiment, numbers in as_json(experiment_numbers(analyses, table)).items():
-        named_values = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
-        curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named_values]
-    return curves
+    io.write_text(reports / "index.html", index_page([one for one in results if "described" in one]))
 
 
 def planned_scene(settings: Settings) -> Scene:

@@ -5,7 +5,8 @@ The captures have the same wire format as those of recorded boards, so that all 
 
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
+
+from tqdm import tqdm
 
 from pipeline.executors import make_executor
 from pipeline.settings import Settings
@@ -38,25 +39,18 @@ def simulate(settings: Settings, protocol: str, raw: Path) -> None:
         folder.mkdir()
         futures = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]
         overruns: Counter[str] = Counter()
-        for i, future in enumerate(futures, 1):
-            capture = future.result()
-            overruns.update(capture.overruns)
-            say(f"{settings.scene}: simulated {capture.name} ({i}/{len(pairs)}): {capture.protocol}")
+        for future in tqdm(futures, unit="capture"):
+            overruns.update(future.result())
         if +overruns:
             counts = ", ".join(f"{what}: {n}" for what, n in (+overruns).items())
             say(f"{settings.scene}: in all simulated captures of protocol {protocol}: {counts}")
 
 
-class _Written(NamedTuple):
-    name: str  # of the capture
-    protocol: str  # a description
-    overruns: dict[str, int]  # maps each kind of value out of range to the number of such values
-
-
 def _write_capture(
     simulation: SimulationSettings, protocol: str, pair: tuple[str, str], seed: int, folder: Path
-) -> _Written:
+) -> dict[str, int]:
+    """Simulate and write one capture; return the number of values out of range, by their kind."""
     board, skin = pair
     capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
     write_capture(folder / capture.name, *to_files(capture, simulation))
-    return _Written(capture.name, capture.protocol, capture.overruns)
+    return capture.overruns

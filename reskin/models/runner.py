@@ -9,7 +9,6 @@ not completed are trained.
 
 import hashlib
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
@@ -17,6 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from reskin import io
 from reskin.errors import SchemaError, TrainingError
@@ -57,7 +57,7 @@ def run_jobs(
     cache
         Folder with the results of completed training runs.
     log
-        Function that is called with one line of text for each completed stack, and with warnings.
+        Function that is called with messages and warnings.
     """
     results = _run_once(jobs, data, executor, cache, log)
     for attempt_i in range(1, MAX_ATTEMPTS_N):
@@ -98,7 +98,7 @@ def _run_once(
         tensors = {"db_uT": data.db_uT, "target": data.target, "skin": skin} | dict(folds.values())
         io.write_tensors(shared_file, tensors, {})
         try:
-            _run_stacks(work, shared_file, folds, executor, log)
+            _run_stacks(work, shared_file, folds, executor)
         finally:
             io.remove(shared_file)
     file_of = {key: file for stack, files in planned for key, file in zip(stack, files, strict=True)}
@@ -123,9 +123,8 @@ def _result_files(stack: Sequence[str], cache: Path) -> list[Path]:
 
 def _run_stacks(
     stacks: Sequence[tuple[Sequence[TrainingJob], Sequence[Path]]], shared_file: Path, folds: FoldRows,
-    executor: Executor, log: Callable[[str], None],
+    executor: Executor,
 ) -> None:  # fmt: skip
-    start_s, done_n, jobs_n = time.monotonic(), 0, sum(len(stack) for stack, _ in stacks)
     running = {}
     for stack, files in stacks:
         remote = [
@@ -133,17 +132,17 @@ def _run_stacks(
             for job in stack
         ]
         running[executor.submit(_train_to_files, shared_file, remote, files)] = stack
-    for future in as_completed(running):
-        try:
-            future.result()
-        except Exception as error:
-            executor.shutdown(cancel_futures=True)
-            if isinstance(error, TrainingError):
-                raise TrainingError(f"{running[future][0].name}, {error}") from None
-            raise
-        done_n += len(running[future])
-        left_s = (time.monotonic() - start_s) / done_n * (jobs_n - done_n)
-        log(f"{done_n}/{jobs_n} {running[future][-1].name}, about {left_s:.0f} s left")
+    with tqdm(total=sum(map(len, running.values())), unit="training") as bar:
+        for future in as_completed(running):
+            try:
+                future.result()
+            except Exception as error:
+                for other in running:
+                    other.cancel()
+                if isinstance(error, TrainingError):
+                    raise TrainingError(f"{running[future][0].name}, {error}") from None
+                raise
+            bar.update(len(running[future]))
 
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:

@@ -1,5 +1,6 @@
 """Write benchmark results into the generated blocks of pages in docs/."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from pipeline.formatting import to_markdown
-from pipeline.report.readme import fill
 from reskin import io
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,7 +17,11 @@ MEASURED = ROOT / "docs/measured"  # one file per benchmark; pages are generated
 def write_block(page: str, name: str, parts: Sequence[str]) -> None:
     """Replace the content between the markers of a block by paragraphs and tables."""
     file = ROOT / "docs" / page
-    io.write_text(file, fill({page: file.read_text(encoding="utf-8")}, {name: "\n\n".join(parts)})[page])
+    before, opening, _, closing, after = re.split(
+        rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", file.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    text = "\n\n".join(parts)
+    io.write_text(file, f"{before}{opening}{text}\n{closing}{after}")
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -11,11 +11,9 @@ from itertools import pairwise
 from math import log
 from typing import Any
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
-from pipeline.plot import COLOURS, MARKERS, STYLE, svg
+from pipeline.plot import drawing, svg
 from reskin import io
 from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
@@ -93,19 +91,14 @@ def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
 
 def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
     """Return a log-log figure (SVG) of cost against count: a panel per quantity, a colour and marker per stage."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.6, 3.1 * len(panels)), layout="constrained")
+    with drawing(5.0 * len(panels), "Cost against size") as figure:
         for axes, (title, (count, points)) in zip(
             figure.subplots(len(panels), 1, squeeze=False).flat, panels.items(), strict=True
         ):
-            for i, (name, stage_points) in enumerate(points.items()):
-                ns, values = zip(*stage_points, strict=True)
-                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
-                axes.plot(ns, values, label=name, linewidth=1, markersize=4, **style)
-            axes.set(xscale="log", yscale="log", xlabel=count)
-            axes.grid(alpha=0.25)
-            axes.set_title(title, loc="left", fontsize=9)
-            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+            for name, stage_points in points.items():
+                axes.plot(*zip(*stage_points, strict=True), label=name)
+            axes.set(xscale="log", yscale="log", xlabel=count, title=title)
+            axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=2)
         return svg(figure)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.manage.compare import compare
+from pipeline.manage.verify import flatten
 from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
@@ -78,15 +78,19 @@ def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     """Return the counts of equal and differing values, the largest relative difference, and the name of its value."""
-    done = compare(first, other)
-    found = {
-        "equal_n": done.equal.total(),
-        "values_n": done.equal.total() + len(done.differing),
-        "absent_n": len(done.missing) + len(done.new),
+    one, two = flatten(first), flatten(other)
+    common = one.keys() & two.keys()
+    differing = {name: (json.loads(one[name]), json.loads(two[name])) for name in common if one[name] != two[name]}
+    relative = {
+        name: abs(old - new) / max(abs(old), abs(new))
+        for name, (old, new) in differing.items()
+        if isinstance(old, float) and isinstance(new, float)
     }
-    numbers = [one for one in done.differing if one.relative is not None]
-    largest = max(numbers, key=lambda one: one.relative or 0.0, default=None)
-    return found | ({"largest_relative": largest.relative, "of": largest.name} if largest else {})
+    found = {
+        "equal_n": len(common) - len(differing), "values_n": len(common), "absent_n": len(one.keys() ^ two.keys()),
+    }  # fmt: skip
+    largest = max(relative, key=lambda name: relative[name], default=None)
+    return found | ({"largest_relative": relative[largest], "of": largest} if largest else {})
 
 
 def main() -> None:

@@ -186,4 +186,4 @@ def test_figure_shows_only_methods_with_run_times():
     timed = [row | {"seconds": 0.1 * i + 0.1} for i, row in enumerate(rows)]
     (drawing,) = figures({"rows": timed}, {}, "simulated").values()
     assert "training" in drawing
-    assert "run time / s" in drawing
+    assert "run time / ms" in drawing

@@ -104,7 +104,7 @@ def results(settings: Settings, section: Interference, folder: Path) -> dict:
     scores = experiment.run(settings, section, folder / "raw", folder / "indentations")
     numbers = as_json(experiment.summarise(scores, {"draws_n": section.draws_n}))
     assert set(interference_tables(numbers)) == {"interference_contacts", "interference_places"}
-    assert experiment.figures(numbers, {}, "recorded")["interference.svg"].startswith("<?xml")
+    assert experiment.figures(numbers, {}, "recorded")["interference.svg"].startswith("<svg")
     return {(row["field"], row["method"], row["external_uT"], row.get("labels_n")): row
             for row in numbers["contacts"] + numbers["places"]}  # fmt: skip
 

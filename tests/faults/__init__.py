@@ -1,1 +1,1 @@
-"""Fault injection: `make faults` damages copies of a checkout whose pipeline has run, and writes docs/faults.md."""
+"""Fault injection: `python -m tests.faults` damages copies of a finished checkout, and writes docs/faults.md."""

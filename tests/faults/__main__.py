@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from reskin import io
-from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
+from tests.faults import files, kills, together  # noqa: F401 (importing a module adds its faults)
 from tests.faults.harness import CASES, Checkout, Row, copy, line, make_template, not_run, table
 from tests.repositories import git
 from tests.stages.checkout import ROOT
@@ -80,14 +80,14 @@ INTRODUCTION = """\
 # Faults and recovery
 
 This page lists what happens when a process, disk, file or server fails while `dvc repro` runs, and what is lost.
-`make faults` injects each fault into a finished run of a part of scene `ci`, and then runs `dvc repro` again. A row
+`python -m tests.faults` injects each fault into a finished part of scene `ci`, and then runs `dvc repro` again. A row
 is green if four conditions are met: a command that fails prints a message and no traceback; no command takes more than
 ten minutes; no finished stage or training run is computed again; and all outputs equal those of the undisturbed run.
 
-If you suspect that a disk is damaged, or if a message asks you to, run `reskin check-cache`, then `dvc repro`. DVC
-restores outputs from its cache without reading them. `reskin check-cache` reads every object in the cache, sets damaged
-objects aside and removes their copies. Arrays (safetensors) and tables (Parquet) contain checksums, so reading a
-damaged file is an error.
+If you suspect that a disk is damaged, or if a message asks you to, delete the output that contains the damaged file and
+DVC's cache (`.dvc/cache/files`), then run `dvc repro`. All stages then run again, but no training run is repeated. DVC
+restores outputs from its cache without reading them. Arrays (safetensors) and tables (Parquet) contain checksums, so
+reading a damaged file is an error.
 
 {green_n} of {faults_n} rows are green, and {not_run_n} faults have not been injected yet. Code
 (`git rev-parse HEAD:pipeline`): {code}. Machine: {cores_n} cores, load {load:.0f} at the end, Python {python}. All

@@ -110,10 +110,9 @@ class Checkout:
         }
 
     def command(self, stage: str) -> list[str]:
-        """Return the command of a stage, from dvc.lock; the report has a second command, `publish`."""
+        """Return the command of a stage, from dvc.lock."""
         entries = YAML(typ="safe").load((self.folder / "dvc.lock").read_text())["stages"].values()
-        commands = [entry["cmd"] if isinstance(entry["cmd"], list) else [entry["cmd"]] for entry in entries]
-        return next(command.split() for of_stage in commands for command in of_stage if f" {stage} " in command)
+        return next(entry["cmd"].split() for entry in entries if f" {stage} " in entry["cmd"])
 
     def reset(self, *names: str, trainings: bool = True) -> None:
         """Remove entries in dvc.lock, outputs and cached training runs of these stages, so that they run again."""

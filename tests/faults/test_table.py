@@ -2,7 +2,7 @@
 
 import tempfile
 
-from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
+from tests.faults import files, kills, together  # noqa: F401 (importing a module adds its faults)
 from tests.faults.__main__ import OUT
 from tests.faults.harness import CASES, Row, line, message_of
 

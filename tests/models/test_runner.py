@@ -146,7 +146,7 @@ def test_damaged_result_in_the_cache_is_reported_and_trained_again(tmp_path, dam
     content[-5] ^= 1  # One bit of a weight is changed. The file format does not detect such damage.
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
     again = run(jobs(), tmp_path, log=log)
-    assert [line.startswith("warning: a cached result is damaged") for line in log[:2]] == [True, False]
+    assert [line.startswith("warning: a cached result is damaged") for line in log] == [True]
     assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
 
 

@@ -154,8 +154,8 @@ def test_every_row_names_its_source():
         ours = tables.pop("table1")[OURS]  # This table is table 1 of the paper, with one more column for our skin.
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
-        for table in tables.values():
-            assert set(table["source"]) == {source}
+        for name in tables.keys() - {"claims"}:
+            assert set(tables[name]["source"]) == {source}
 
 
 def test_table_2_contains_the_papers_numbers():
