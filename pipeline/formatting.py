@@ -1,31 +1,15 @@
-"""Scores as text (means, deviations, intervals, paired differences), and tables as Markdown."""
+"""Scores as text: means with their deviations or intervals, and paired differences."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from pipeline.paper import Number
 from pipeline.statistics import Stat, as_json
 
 Statistic = Stat | Mapping[str, Any]  # a statistic, or its entry in numbers.json
-COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
-PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
-MEANING = (
-    "Accuracy: percentage of held-out readings whose predicted x and y are both within 1 mm of the true position. "
-    "MSE_xy: mean squared error of the position, averaged over x and y."
-)
-INTERVAL = (
-    "[low, high] is the 95 % interval over held-out boards (Student's t). The value of a board is the mean over its "
-    "skins and networks. With fewer than four boards there is no interval, and (a; b) are the values of the boards."
-)
-SPREAD = (
-    f"{INTERVAL} ± is a standard deviation. If networks are tested on the skin on which they were trained, n is the "
-    "number of random splits into training and test rows, and ± is the standard deviation of the scores of these "
-    "splits. If networks are tested on other skins, n is the number of pairs of a training skin and a test skin. A "
-    "standard deviation with the mark (seeds) is that of networks that differ only in their random seed."
-)
+COLUMNS = {"accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
+NONE = "–"  # a value that does not exist
 # Titles of methods, by their short names in the table of scores.
 TITLES = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",
@@ -40,40 +24,42 @@ TITLES = {
 DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
 
 
-def show(value: Statistic | None) -> str:
-    """Write a mean, its interval over boards (or else its standard deviation), and its standard deviation over seeds.
+def show(value: Statistic | float) -> str:
+    """Write a mean and its 95 % interval over boards, or the values of few boards, or else its standard deviation.
 
-    All these numbers have as many decimals as `decimals` returns.
+    A standard deviation over seeds follows, if it is known. All numbers have as many decimals as `decimals` returns.
+
+    >>> show({"mean": 78.7, "n": 6, "ci95": [72.1, 84.2]}), show({"mean": 85.0, "n": 2, "values": [80.0, 90.0]})
+    ('78.7 [72.1, 84.2]', '85.0 (80.0; 90.0)')
     """
-    if value is None:
-        return "–"
-    stat = Stat.of(value)
-    return f"{_rounded_mean(stat)} {show_interval(stat)}{_show_seeds(stat)}" if stat.ends else show_deviation(stat)
-
-
-def show_deviation(value: Statistic) -> str:
-    """Write a mean with its standard deviations over the n values and over seeds, if they are known."""
-    stat = Stat.of(value)
-    over_n = "" if stat.sd is None else f" ± {_rounded_sd(stat, stat.sd)}"
+    stat = Stat.of(value if isinstance(value, Stat | Mapping) else {"mean": value})
+    over_n = _show_interval(stat) if stat.ends else _show_sd(stat)
     return f"{_rounded_mean(stat)}{over_n}{_show_seeds(stat)}"
 
 
-def show_interval(value: Statistic) -> str:
-    """Write the 95 % interval over boards, or the values of a few boards, without the mean."""
-    stat = Stat.of(value)
+def show_with_sd(value: Statistic | float) -> str:
+    """Write a mean with its standard deviation, which the paper also gives, and with its interval over boards."""
+    stat = Stat.of(value if isinstance(value, Stat | Mapping) else {"mean": value})
+    return f"{_rounded_mean(stat)}{_show_sd(stat)}{_show_seeds(stat)}{_show_interval(stat) if stat.ends else ''}"
+
+
+def show_difference(value: Statistic) -> str:
+    """Write a mean difference with its sign."""
+    return ("+" if Stat.of(value).mean > 0 else "") + show(value)
+
+
+def _show_interval(stat: Stat) -> str:
     digits = decimals(stat)
     ends = [three_digits(end) if digits is None else f"{end:z.{digits}f}" for end in stat.ends]
-    return f"({'; '.join(ends)})" if stat.few else f"[{', '.join(ends)}]"
+    return f" ({'; '.join(ends)})" if stat.few else f" [{', '.join(ends)}]"
 
 
-def show_with_unit(value: Statistic | None, unit: str) -> str:
-    """Write a mean with its unit, then its uncertainty.
+def _show_sd(stat: Stat) -> str:
+    return "" if stat.sd is None else f" ± {_rounded_sd(stat, stat.sd)}"
 
-    >>> show_with_unit({"mean": 78.7, "n": 6, "ci95": [72.1, 84.2]}, "%")
-    '78.7 % [72.1, 84.2]'
-    """
-    mean, *uncertainty = show(value).split(" ", 1)
-    return " ".join([mean, unit, *uncertainty]) if value else mean
+
+def _show_seeds(stat: Stat) -> str:
+    return "" if stat.sd_seeds is None else f" ± {_rounded_sd(stat, stat.sd_seeds)} (seeds)"
 
 
 def decimals(value: Statistic) -> int | None:
@@ -117,32 +103,6 @@ def _rounded_sd(stat: Stat, sd: float) -> str:
     return text if float(text) or not sd else f"{sd:.1g}"
 
 
-def show_digits(value: Statistic, digits: int) -> str:
-    """Write a mean with `digits` decimals, and its interval over boards and standard deviation over seeds, if known."""
-    stat = Stat.of(value)
-    mean, *ends = [f"{number:.{digits}f}" for number in (stat.mean, *stat.ends)]
-    if not ends:
-        return f"{mean}{_show_seeds(stat)}"
-    boards = f"({'; '.join(ends)})" if stat.few else f"[{', '.join(ends)}]"
-    return f"{mean} {boards}{_show_seeds(stat)}"
-
-
-def show_both(value: Statistic | None) -> str:
-    """Write a mean with its standard deviation, which the paper also gives, and with its interval over boards."""
-    if value is None or not Stat.of(value).ends:
-        return show(value)
-    return f"{show_deviation(value)} {show_interval(value)}"
-
-
-def show_difference(value: Statistic | None) -> str:
-    """Write a mean difference with its sign."""
-    return "–" if value is None else ("+" if Stat.of(value).mean > 0 else "") + show(value)
-
-
-def _show_seeds(stat: Stat) -> str:
-    return "" if stat.sd_seeds is None else f" ± {_rounded_sd(stat, stat.sd_seeds)} (seeds)"
-
-
 def three_digits(value: float) -> str:
     """Write a number with three significant digits; four if it is 100 or more."""
     return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
@@ -155,67 +115,6 @@ def two_digits(value: float) -> str:
     ['0.60', '1.2', '47', '100']
     """
     return f"{value:.0f}" if abs(value) >= 9.95 else f"{value:#.2g}"
-
-
-def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[str, str]:
-    """Write every metric of a row as text; return the cells by column title."""
-    return {title: show(row.get(metric)) for metric, title in titles.items()}
-
-
-def scored(row: Mapping[str, Any]) -> dict[str, str]:
-    """Write every metric of a row, and the number n that it is averaged over, as text; return cells by column title."""
-    return scores(row) | {"n": n_of(row)}
-
-
-def beside(
-    row: Mapping[str, Any],
-    printed: Mapping[str, str],
-    show: Callable[[Statistic | None], str],
-    *,
-    columns: Mapping[str, str] = COLUMNS,
-    paper: str = "paper",
-) -> dict[str, str]:
-    """Write each metric of a row beside the paper's value (`printed`), and then n; return cells by column title."""
-    cells: dict[str, str] = {}
-    for metric, title in columns.items():
-        cells |= {f"{title} (ours)": show(row.get(metric))}
-        if metric in PAPER_METRICS or metric in printed:
-            cells |= {f"{title} ({paper})": printed.get(metric, "–")}
-    return cells | {"n": n_of(row)}
-
-
-def printed(paper: Mapping[str, Number] | Mapping[str, float]) -> dict[str, str]:
-    """Write the paper's scores, which are means or pairs of mean and standard deviation, as text by metric."""
-    return {
-        metric: "{:g} ± {:g}".format(*value) if isinstance(value, tuple) else f"{value:g}"
-        for metric, value in paper.items()
-    }
-
-
-def n_of(row: Mapping[str, Any]) -> str:
-    """Write the number of boards, pairs or repeats that the scores of a row are averaged over."""
-    return str(row.get("accuracy_pct", row.get("mse_f_N2"))["n"])
-
-
-def tabulate(lines: Sequence[Mapping[str, str]], **notes: str) -> pd.DataFrame:
-    """Make a table with two notes to show below it: `meaning`, and `spread`, which explains ± and brackets."""
-    table = pd.DataFrame(lines)
-    table.attrs.update(notes)
-    return table
-
-
-def notes(table: pd.DataFrame) -> list[str]:
-    """List the notes to show below a table."""
-    meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
-    if any("accuracy" in str(column) for column in table.columns):
-        meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
-    return meanings
-
-
-def to_markdown(table: pd.DataFrame) -> str:
-    """Write a table and its notes as Markdown; unknown cells are empty."""
-    text = str(table.fillna("").to_markdown(index=False, disable_numparse=True)) + "\n"
-    return text + "".join(f"\n{note}\n" for note in notes(table))
 
 
 def rounded(value: Any, digits: int = 6) -> Any:

@@ -31,23 +31,6 @@ def _subtract(means: Mapping[str, float], others: Mapping[str, float]) -> dict[s
     return {name: round(means[name] - others[name], 3) for name in means}
 
 
-# Figure 6 is printed without numbers; these are statements of the text about it.
-FIGURE_6A = (
-    '"a significant improvement in performance between no self-supervision and using 780 points", which "seems to '
-    'plateau as we increase the data beyond this point"'
-)
-FIGURE_6B = (
-    '"performance improves as the amount of training data increases"; adaptation, "while always doing better than the '
-    'other models, offers a significant improvement in performance when using fewer sensors in training"'
-)
-
-SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
-SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
-# Figure 4 is also printed without numbers, so only a statement of the text about it is quoted.
-FIGURE_4 = (
-    '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
-    'samples"'
-)
 SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_xy_mm2": (0.085, 0.006),
     "mse_fxy_N2": (0.0011, 0.0002),
@@ -81,4 +64,20 @@ PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% ac
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: "seems to plateau" beyond this number
 MONOTONIC = '"monotonically increasing sensor measurements"'
-FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'
+
+# Table 1 as printed (section 2): "yes" is a tick, "no" a cross, "?" a question mark.
+TABLE_1: dict[str, list[str]] = {
+    "property": [
+        "Type", "Frequency", "Variable Form Factor", "Thickness < 3mm", "Low Cost", "Easily replaceable",
+        "Area coverage", "Durable (> 50k contacts)",
+    ],
+    "ReSkin": ["Magnetic", "400Hz", "yes", "yes", "yes", "yes", "yes", "yes"],  # the paper itself
+    # M. Lambeta et al., IEEE Robotics and Automation Letters 5(3): 3838-3845, 2020
+    "DIGIT": ["Optical", "60 Hz", "no", "no", "yes", "yes", "no", "?"],
+    # E. Donlon et al., IROS 2018: 1927-1934
+    "GelSlim": ["Optical", "60 Hz", "no", "no", "yes", "yes", "no", "no"],
+    # B. Sundaralingam et al., ICRA 2019: 9035-9042
+    "BioTac": ["MEMS", "100 Hz", "no", "no", "no", "?", "no", "yes"],
+    # T. Bhattacharjee et al., World Haptics Conference 2013: 103-108
+    "RSkin": ["Piezoresistive", "?", "yes", "yes", "no", "no", "yes", "?"],
+}  # fmt: skip

@@ -1,7 +1,4 @@
-"""Numbers, tables and figures that experiments add to a report.
-
-An experiment's module makes its figures, and `pipeline.report.experiment_tables` makes its tables.
-"""
+"""Numbers and figures that experiments add to a report; their tables are in `pipeline.report.tables`."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -11,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from pipeline.catalogue import ANALYSES, EXPERIMENTS, module_name
-from pipeline.report.experiment_tables import TABLES
 from pipeline.scores import select
 
 
@@ -26,15 +22,6 @@ def experiment_numbers(results: Mapping[str, Any], table: pd.DataFrame) -> dict[
         scores = select(table, experiment=name)
         numbers[name] = module.summarise(scores, result["numbers"]) if EXPERIMENTS[name].scores else result["numbers"]
     return numbers
-
-
-def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make the tables of every experiment with results in numbers.json; return them by name."""
-    tables: dict[str, pd.DataFrame] = {}
-    for key, make in TABLES.items():
-        if key in numbers:
-            tables |= make(numbers[key], source)
-    return tables
 
 
 def experiment_figures(numbers: Mapping[str, Any], plot_data: Mapping[str, Any], source: str) -> dict[str, str]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from pipeline.formatting import COLUMNS, TITLES, two_digits
 from pipeline.paper import ADAPTED_POKES_N, TABLE_2
 from pipeline.plot import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
-from pipeline.report.table_2 import models
+from pipeline.report.tables import models
 from pipeline.statistics import Stat
 
 HEADLINE = "headline.svg"

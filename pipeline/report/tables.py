@@ -1,754 +1,624 @@
-"""Tables of a scene, made from numbers.json and written as Markdown for readers and as CSV for programs."""
+"""Tables of a scene, made from numbers.json: one function per table, in the paper's order.
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+A table holds what a reader sees: its cells are numbers or texts such as "84 [73, 91]". A function is called only if
+numbers.json has the key that its decorator names. Cells without a value are shown as a dash, and columns without any
+value are left out.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from pydantic import model_validator
 
-from pipeline import scenes
+from pipeline import paper
 from pipeline.experiments.drift import policies_in
-from pipeline.formatting import (
-    COLUMNS,
-    INTERVAL,
-    PAPER_METRICS,
-    TITLES,
-    beside,
-    n_of,
-    printed,
-    scored,
-    scores,
-    show,
-    show_both,
-    show_difference,
-    show_with_unit,
-    tabulate,
-    three_digits,
-    to_markdown,
-)
-from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
+from pipeline.experiments.gripper import PRESSES
+from pipeline.experiments.sensitivity import READINGS
+from pipeline.formatting import COLUMNS, NONE, TITLES, show, show_difference, show_with_sd, three_digits
 from pipeline.report.claims import NOT_RUN, NOT_TESTABLE, evaluate, read_claims
-from pipeline.report.experiments import experiment_tables
-from pipeline.report.figures import unseen_rows
 from pipeline.report.numbers import timed_rows
-from pipeline.report.table_2 import Model, models, table_2_rows
 from pipeline.statistics import Stat
-from reskin.config import Strict, parse, read_yaml
-from reskin.errors import ParamsError
 
-Numbers = Mapping[str, Any]
-Rows = Sequence[Mapping[str, Any]]
+Numbers = Mapping[str, Any]  # numbers.json of a scene, or a part of it
+Line = dict[str, Any]  # the cells of a row of a table, by column title
+Make = Callable[[Numbers], pd.DataFrame]
+TABLES: dict[str, tuple[str, Make]] = {}  # for each table: the key of numbers.json that it needs, and its function
+
+PLACES = {name: COLUMNS[name] for name in ("accuracy_pct", "mse_xy_mm2")}
+ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
+CONTROL = "Control: fine-tuned equally long, without pokes of the new skin"
 SPLITS = {
-    "single_random": "random readings held out (as in the paper; one indentation has readings in training and in test)",
-    "single_indentation": "random indentations held out (an indentation is never split between training and test)",
-    "single_pass": "random passes held out (each pass presses all places to all depths)",
-    "single_temporal": "last passes held out (trained on the first passes, tested on the last passes)",
-}
-BEFORE_TOUCH = {
-    "noload": "only the no-load reading before the indentation",
-    "scan": "only the number of the indentation in its pass",
-}
-BEFORE_TOUCH_MEANING = (
-    'The rows "position from only ..." show how well the position can be guessed without touching the skin. These '
-    "guesses do not use the field change, but only the quantity that the row names: the guess is the mean position of "
-    "the two training readings in which this quantity is most similar. The row with the number of the indentation "
-    "shows how exactly the rig repeats its order of places in each pass. No network receives this number. After an "
-    "indentation, some of its field change remains for a while. The row with the no-load reading shows how much this "
-    "remaining field reveals about the order of places. A network may use the remaining field, because it is part of "
-    "the field change."
-)
-SEEN_TIP = (
-    "For some skins, the models also predict the position of a tip that only hovers above the skin, because the tip "
-    "itself is magnetic. The scores of these skins are therefore no evidence that a touch is sensed, and they are not "
-    "comparable with the paper's numbers"
-)
-HOVER_MEANING = (
-    "This control shows whether the chips sense the tip itself. Models that were trained on contacts predict the "
-    "position from readings in which the tip hovers above the place that it touches next. One model is the network. "
-    "The other model is the mean position of the 2 contacts in training whose field changes are most similar. If the "
-    "chips sense no tip, only a few percent of the predictions are within 1 mm, by chance. If at least a quarter of "
-    "the predictions from the 2 nearest contacts are within 1 mm (a threshold that we assumed), the chips sense the "
-    "magnetism of the tip. |dB| is the length of the vector of field changes; without contact, it includes the noise "
-    "of the no-load reading."
-)
-TABLE_2_SPREAD = (
-    "± is the standard deviation, which the paper also reports. In row Single-sensor, each network was trained on one "
-    "skin and tested on others. There, n is the number of pairs of a training skin and a test skin, and the standard "
-    "deviation is that of the scores of these pairs. In all other rows, n is the number of held-out boards, and the "
-    f"standard deviation is that of the scores of these boards. {INTERVAL}"
-)
-SUMMARY_SPREAD = (
-    f"{INTERVAL} In row Single-sensor, n is the number of pairs of a training skin and a test skin, and ± is the "
-    "standard deviation of the scores of these pairs. In all other rows, n is the number of held-out boards. The last "
-    "number in parentheses is the paper's mean."
-)
-TARGET = (
-    "An earlier version of the simulation was tuned until it agreed with the paper's row Single-sensor. Some of the "
-    "tuned variations between skins are still used, so agreement in this row is not evidence."
-)
-CONSTANT = "constant force: the mean over the tested indentations"
-COLLAPSED_MEANING = (
-    "A network has collapsed if its output is nearly constant, so that it explains almost nothing of some target on "
-    "its own training rows. A collapsed network is trained again with other random draws, at most twice. A network "
-    "that collapses every time is kept and included in all means. Very short runs are not checked for collapse."
-)
-REGISTERED_MEANING = (
-    "Registered: before these scores are computed, the mean position error of each board is subtracted from the "
-    "predicted positions of this board. This mean error is computed from the labels of the board, so registered "
-    "scores are only a diagnosis. The labelled and unlabelled indentations that a method receives are at the same "
-    "places of the new board as the tested indentations, but at other depths."
-)
-CONTROLLED = (
-    "The row with 0 pokes has the scores of the network before fine-tuning. To see what fine-tuning changes without "
-    "pokes of the new skin, see row Control of table 2."
-)
-BUDGETS = "The number of training steps is a setting of the scene. It was not chosen by these scores."
-DRAWS = (
-    "[low, high] is the 95 % interval over n held-out boards (Student's t). With fewer than four boards there is no "
-    "interval, and (a; b) are the values of the boards. For each board, training skins are drawn at random, several "
-    "times. The value of a board is the mean over all networks that were tested on it."
-)
-OVER_BOARDS = "± is the standard deviation of the scores of n boards."
-
-QUANTITIES = {
+    "single_random": "random readings", "single_indentation": "random indentations", "single_pass": "random passes",
+    "single_temporal": "last passes",
+}  # fmt: skip
+BEFORE_TOUCH = {"noload": "no-load reading only", "scan": "number in the pass only"}
+HOVER = {"hover": "2 nearest contacts", "hover_network": "network"}
+SHEAR = {
+    "mse_fxy_N2": "MSE_Fxy, N²", "mse_fz_N2": "MSE_Fz, N²", **PLACES, "explained_fxy": "explained variance of Fxy",
+    "explained_fz": "explained variance of Fz",
+}  # fmt: skip
+ADAPTATION = ("before", "after", "control", "grid")
+SLEEVE = COLUMNS | {"median_error_mm": "median error, mm", "p95_error_mm": "95 % of errors below, mm"}
+TURNING = {
+    "contacts_true_n": "true contacts", "contacts_n": "contacts found", "false_readings_n": "false readings",
+    "missed_readings_n": "missed readings", "mse_f_N2": "MSE_F, N²", "accuracy_pct": "within 1 mm, %",
+}  # fmt: skip
+LOGS = TURNING | {
+    "mse_xy_mm2": "MSE_xy, mm²", "contact_readings_n": "readings in contact",
+    "missed_force_max_N": "largest force of a missed reading, N", "force_max_N": "largest estimated force, N",
+    "force_true_max_N": "largest true force, N",
+}  # fmt: skip
+FORCE_FROM = {"networks": TITLES["multi"], "map": TITLES["shipped"]}
+INTERFERENCE = {"rms_uT": "rms of changes, µT", "false_pct": "false contacts, %", "detected_pct": "detected presses, %"}
+COVERED = {"accuracy_pct": COLUMNS["accuracy_pct"], "coverage_pct": "in 90 % interval, %"}
+NEW_BOARD = {
+    **PLACES, "rms_f_N": "rms error of F, N", "r2_f": "R² of F", "coverage_pct": "place in 90 % interval, %",
+    "coverage_f_pct": "force in 90 % interval, %",
+}  # fmt: skip
+CONTACT = {"false_pct": "false touches, %", "missed_pct": "missed touches, %"}
+NOLOAD_AGES = {"each": "before each press", "previous": "before the press before", "initial": "at the start"}
+SIMULATIONS = {
+    "fitted": "law fitted to this board", "refitted": "law of another board, refitted", "nominal": "nominal skin",
+}  # fmt: skip
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # row that we add to table 1
+SKINS = {
     "field_at_rest_chip_median_uT": "field at rest, median chip, µT",
     "field_at_rest_channel_max_uT": "field at rest, largest channel, µT",
-    "change_at_0.5_N_uT": "field change at 0.5 N, µT",
-    "change_at_1_N_uT": "field change at 1 N, µT",
-    "change_at_2_N_uT": "field change at 2 N, µT",
-    "change_at_3_N_uT": "field change at 3 N, µT",
-    "change_at_3_N_over_1_N": "field change at 3 N divided by field change at 1 N",
-    "weakest_over_strongest_chip": "field change at the weakest chip divided by field change at the strongest chip",
+    "change_at_0.5_N_uT": "field change at 0.5 N, µT", "change_at_1_N_uT": "field change at 1 N, µT",
+    "change_at_2_N_uT": "field change at 2 N, µT", "change_at_3_N_uT": "field change at 3 N, µT",
+    "change_at_3_N_over_1_N": "field change at 3 N / at 1 N",
+    "weakest_over_strongest_chip": "field change, weakest / strongest chip",
     "rest_changes_in_1_uT": "field at rest, rms change over 1 contact, µT",
     "rest_changes_in_10_uT": "field at rest, rms change over 10 contacts, µT",
     "rest_changes_in_100_uT": "field at rest, rms change over 100 contacts, µT",
     "rest_changes_in_1000_uT": "field at rest, rms change over 1,000 contacts, µT",
-    "noise_xy_uT": "noise of one reading, x and y, µT",
-    "noise_z_uT": "noise of one reading, z, µT",
-    "step_xy_uT": "resolution of a chip (one digital step), x and y, µT",
-    "step_z_uT": "resolution of a chip (one digital step), z, µT",
-    "rate_hz": "readings per second at one stop",
-    "force_median_N": "force, median, N",
+    "noise_xy_uT": "noise of a reading, x and y, µT", "noise_z_uT": "noise of a reading, z, µT",
+    "step_xy_uT": "digital step of a chip, x and y, µT", "step_z_uT": "digital step of a chip, z, µT",
+    "rate_hz": "readings per second at one stop", "force_median_N": "force, median, N",
     "force_max_N": "force, largest, N",
-}
-PAIRED = (
-    "A difference compares two models on the same test rows. On each skin, scores are averaged over networks, "
-    "and the second model's mean is subtracted from the first model's mean. These differences are averaged over the "
-    "skins of a board. [low, high] is the 95 % interval over n boards (Student's t). With fewer than four boards there "
-    "is no interval, and (a; b) are the values of the boards. If the second model is the single-sensor network, only "
-    "the boards on which this network was tested are used, and the interval also accounts for the differences between "
-    "its training skins. Our verdicts on the differences are in table claims."
-)
-FINAL_MEANING = (
-    "The final model itself was not tested, because no board was left to test it on. The scores belong to networks "
-    "that were trained in the same way, but each without one of the boards, on which it was then tested. These scores "
-    "estimate the scores of the final model on a further board."
-)
-SKINS_MEANING = (
-    "Each cell has the mean over skins, then the smallest and the largest value of a skin in brackets, then the "
-    "number of skins in parentheses. The field change of a reading is the length of the vector that contains the "
-    "changes of all channels. For example, the field change at 1 N is the median over those readings of the skin whose "
-    "force is from 0.8 N to 1.2 N (1 N ± 20 %). A dash (–) means that there are too few such readings."
-)
-SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
-HELD_OUT = "model, tested on held-out boards"  # heading of the first column of a summary
-NEW_BOARD = {
-    "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "rms_f_N": "rms error of F, N", "r2_f": "R² of F",
-    "coverage_pct": "place in 90 % interval, %", "coverage_f_pct": "force in 90 % interval, %",
 }  # fmt: skip
-DIFFERENCE = "within 1 mm, minus the shipped model (± over draws)"
-NEW_BOARD_SPREAD = "Scores are means over draws, then over boards; (a; b) are the values of the boards."
-NOLOAD_AGES = {"each": "before each press", "previous": "before the press before", "initial": "at the start"}
-CONTACT = {"false_pct": "false touches, %", "missed_pct": "missed touches, %"}
-COMPUTED = (
-    "Column computed is the time that a stage takes to compute all its results if its training runs run one after "
-    "another. The last run may have taken less time, because training runs run in parallel and are reused."
-)
-CASES = {
-    "area": "area", "what": "what", "reference": "compared with", "error": "error", "limit": "allowed",
-    "reason": "reason for the allowed error",
-}  # fmt: skip
-TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
-SIMULATIONS = {
-    "nominal": "nominal skin", "fitted": "law fitted to this board", "refitted": "law of another board, refitted",
-}  # fmt: skip
-COMPARE_MEANING = (
-    "Cosine: between recorded and simulated dB over all channels, mean over presses. Explained: 1 - |simulated - "
-    "recorded|² / |recorded|², median over presses. Growth: n in |dB| ~ F^n at one place, median over places. The form "
-    "of the law was chosen with data of both boards of scene lab, so only a new board can test it."
-)
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # row that we add to table 1
-OURS = "ours"
-CONTACT_TITLES = {
-    "rms_uT": "rms of changes, µT",
-    "false_pct": "false contacts, %",
-    "detected_pct": "detected presses, %",
-}
-PLACE_TITLES = {"accuracy_pct": "within 1 mm, %", "coverage_pct": "in 90 % interval, %"}
-CONTACTS_MEANING = (
-    "False contacts: readings without contact above the threshold of the live page. Detected presses: presses above "
-    "it if a change of the field is added; values are of boards or pads."
-)
-PLACES_MEANING = (
-    "The model is calibrated, without changes of the field, to 65 presses at half of the places; presses at the other "
-    "places are tested with changes. Labels are presses of the calibration; values are of the pressed boards."
-)
-SHIPPED = "The shipped model, which is made for skins that it has never seen: `reskin.load_universal()`."
-NOT_GIVEN = "–"
 
 
 def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     """Make every table for which the scene has numbers, by name."""
-    source = numbers["provenance"]["source"]
-    tables = {}
-    if "table2" in numbers:
-        tables["table2"] = _table_2(numbers, source)
-    if "paired" in numbers:
-        tables["paired"] = paired_table(numbers, source)
-        boards = paired_boards_table(numbers, source)
-        tables |= {} if boards.empty else {"paired_boards": boards}
-    if any(name in numbers for name in SPLITS):
-        tables["single_sensor"] = _single(numbers, source)
-    if "hover" in numbers:
-        tables["hover"] = _hover(numbers, source)
-    tables |= experiment_tables(numbers, source)
-    makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
-        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
-        "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table,
-        "extremes": extremes_table, "accuracy_and_cost": accuracy_and_cost_table, "trainings": _trainings,
-        "variants": _variants,
-    }  # fmt: skip
-    tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
-    if "new_board" in numbers:
-        tables["new_board"] = new_board_table(numbers["new_board"], source)
-        contact = new_board_contact_table(numbers["new_board"], source)
-        tables |= {} if contact.empty else {"new_board_contact": contact}
-    if "interference" in numbers:
-        tables |= interference_tables(numbers["interference"])
-    if "lobo" in numbers:
-        tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
-    if "final_model" in numbers:
-        tables["final_model"] = final_model_table(numbers)
-    if "described" in numbers:
-        columns = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
-        tables["skins"] = skins_table(columns)
-    tables["captures"] = _captures(numbers, source)
-    if ours := measured(numbers):
-        tables["table1"] = table1(read_table1(), ours)
-    claims = evaluate(numbers, read_claims())
-    return tables if set(claims["verdict"]) <= {NOT_RUN, NOT_TESTABLE} else tables | {"claims": claims}
+    made = {name: make(numbers) for name, (key, make) in TABLES.items() if key in numbers}
+    return {name: _filled(table) for name, table in made.items() if len(table)}
+
+
+def run_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
+    """Make the tables that differ between repeats of a run; numbers: joined with provenance.json."""
+    timed = accuracy_and_cost({"accuracy_and_cost": {"rows": timed_rows(numbers)}})
+    tables = {"accuracy_and_cost": timed, "stages": stages(numbers)}
+    return {name: _filled(table) for name, table in tables.items() if len(table)}
 
 
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
-    """Write every table as Markdown for readers and as CSV for programs: text by file name."""
-    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
-    return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
+    """Write every table as CSV: text by file name."""
+    return {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
 
 
-def compare_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List how each recorded board is oriented, and how well each simulation agrees with it."""
-    lines = []
-    for board, of_board in numbers["by_board"].items():
-        line, orientation = {"board": board, "source": source}, {"orientation": of_board["frames"]["sentence"]}
-        simulations = {"fitted": of_board} if "cosine_mean" in of_board else {}
-        simulations |= {name: of_board[name] for name in ("refitted", "nominal") if name in of_board}
-        for name, agreed in simulations.items():
-            grown = agreed.get("growth")
-            lines.append(line | {
-                "simulation": SIMULATIONS[name], "cosine": f"{agreed['cosine_mean']:.3f}",
-                "explained": f"{agreed['explained_median']:.3f}",
-                "growth (recorded)": f"{grown['simulated']:.2f} ({grown['recorded']:.2f})" if grown else "–",
-            } | orientation)  # fmt: skip
-        lines += [line | orientation] * (not simulations)
-    return tabulate(lines, meaning=COMPARE_MEANING)
+def _filled(table: pd.DataFrame) -> pd.DataFrame:
+    table = table.dropna(axis="columns", how="all").astype(object)
+    return table.where(table.notna(), NONE)
 
 
-def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List scores by number of unlabelled pokes of the new skin; the paper gives them for two numbers of pokes."""
-    in_table_2 = {0: TABLE_2["triplet"], ADAPTED_POKES_N: TABLE_2["adapted"]}
-    lines = [
-        {"pokes": str(row["pokes_n"]), "source": source}
-        | beside(row, printed(in_table_2.get(row["pokes_n"], {})), show, paper="paper, table 2")
-        for row in sorted(rows, key=lambda row: row["pokes_n"])
-    ]
-    return tabulate(lines, meaning=f"The paper says of its figure 6a: {FIGURE_6A}. {CONTROLLED}")
+def of(key: str) -> Callable[[Make], Make]:
+    """Register a function as the table of its name, for scenes whose numbers.json has this key."""
+
+    def register(make: Make) -> Make:
+        TABLES[make.__name__] = (key, make)
+        return make
+
+    return register
 
 
-def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List scores by the number of training skins for each method."""
-    lines = [
-        {"training skins": str(row["skins_n"]), "method": TITLES[row["method"]], "source": source} | scored(row)
-        for row in sorted(rows, key=lambda row: (row["skins_n"], list(TITLES).index(row["method"])))
-    ]
-    return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
+def cells(
+    row: Numbers,
+    columns: Mapping[str, str] = COLUMNS,
+    printed: Numbers | None = None,
+    write: Callable[[Any], str] = show,
+) -> Line:
+    """Write the metrics of a row, each beside the value that the paper prints, if there are such values."""
+    line: Line = {}
+    for metric, title in columns.items():
+        line[title] = write(row[metric]) if metric in row else None
+        value = (printed or {}).get(metric)
+        if printed is not None:
+            line[f"{title} (paper)"] = "{:g} ± {:g}".format(*value) if isinstance(value, tuple) else value
+    return line
 
 
-def interference_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
-    """List detected contacts and accuracy of places, for each changing field, method and value of `external_uT`."""
+def scored(row: Numbers, printed: Numbers | None = None, write: Callable[[Any], str] = show) -> Line:
+    """Write the scores of a row, and the number n of boards, pairs of skins or repeats that they are averaged over."""
+    stat = row.get("accuracy_pct", row.get("mse_f_N2"))
+    return cells(row, printed=printed, write=write) | {"n": str(stat["n"]) if isinstance(stat, Mapping) else "1"}
 
-    def line(row: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, str]:
-        keys = {"field": row["field"].replace("_", " "), "method": TITLES[row["method"]]}
-        return keys | {"external_uT": f"{row['external_uT']:g}"} | scores(row, titles)
 
-    contacts = [line(row, CONTACT_TITLES) for row in numbers["contacts"]]
-    places: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in numbers["places"]:
-        titles = {name: f"{row['labels_n']} labels: {title}" for name, title in PLACE_TITLES.items()}
-        places.setdefault((row["field"], row["method"], row["external_uT"]), {}).update(line(row, titles))
-    return {
-        "interference_contacts": tabulate(contacts, meaning=CONTACTS_MEANING),
-        "interference_places": tabulate([*places.values()], meaning=PLACES_MEANING),
+@dataclass(frozen=True)
+class Model:
+    """A row of table 2: title, short title, and the paper's scores (empty if the paper has no such row)."""
+
+    title: str
+    short: str
+    paper: Mapping[str, paper.Number]
+
+
+def models(numbers: Numbers) -> dict[str, Model]:
+    """Return the rows of table 2 in the paper's order, and the control.
+
+    If networks had only one training skin, the title of their row says so.
+    """
+    titles = paper.TABLE_2_ROWS | {"control": CONTROL}
+    pokes_n = numbers.get("adapt", {}).get("pokes_n", paper.ADAPTED_POKES_N)
+    titles["adapted"] = titles["adapted"].replace(str(paper.ADAPTED_POKES_N), str(pokes_n))
+    found = {row: Model(title, TITLES[row], paper.TABLE_2.get(row, {})) for row, title in titles.items()}
+    boards = numbers.get("lobo", {"by_board": {}})["by_board"].values()
+    if not boards or max(board["trained_on_skins_n"] for board in boards) > 1:
+        return found
+    one_skin = {row: titles[row].replace("Multi-sensor", ONE_TRAINING_SKIN) for row in ("triplet", "adapted")}
+    return found | {
+        "multi": Model(ONE_TRAINING_SKIN, "one training skin", paper.TABLE_2["single"]),
+        "triplet": Model(one_skin["triplet"], "one training skin + triplet", {}),
+        "adapted": Model(one_skin["adapted"], TITLES["adapted"], {}),
     }
 
 
-def new_board_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the scores on held-out boards by method, split and number of labels."""
+@of("table2")
+def table2(numbers: Numbers) -> pd.DataFrame:
+    """Our table 2 beside the paper's; only ours has a control and a constant force."""
+    control = numbers.get("adapt", {}).get("control")
+    ours = numbers["table2"] | ({"control": control} if control else {})
     lines = [
-        {"method": TITLES[row["method"]], "split": row["split"], "unlabelled presses": row["pokes_n"]}
-        | {"labels": row["labels_n"]}
-        | {title: show(row.get(metric)) for metric, title in NEW_BOARD.items()}
-        | {DIFFERENCE: _over_draws(row.get("minus_shipped", {}).get("accuracy_pct"))}
-        | {"source": source}
-        for row in rows
-        if row["method"] != "contact"
+        {"model": model.title} | scored(ours[row], model.paper, show_with_sd)
+        for row, model in models(numbers).items()
+        if row in ours
     ]
-    return tabulate(lines, spread=NEW_BOARD_SPREAD)
+    constant = numbers.get("constant_force", {}).get("table2")
+    return pd.DataFrame(
+        lines + ([{"model": "constant force"} | scored(constant, {}, show_with_sd)] if constant else [])
+    )
 
 
-def _over_draws(difference: Numbers | None) -> str:
+@of("paired")
+def paired(numbers: Numbers) -> pd.DataFrame:
+    """Paired differences between models, beside the differences of the paper's means."""
+    known, lines = models(numbers), []
+    for row in numbers["paired"]:
+        first, second = known[row["of"]], known[row["over"]]
+        both = first.paper.keys() & second.paper.keys() if first.paper != second.paper else ()
+        printed = {metric: f"{first.paper[metric][0] - second.paper[metric][0]:+.4g}" for metric in both}
+        lines.append({"difference": f"{first.short} − {second.short}"} | scored(row, printed, show_difference))
+    return pd.DataFrame(lines)
+
+
+@of("lobo")
+def lobo_boards(numbers: Numbers) -> pd.DataFrame:
+    """Scores of each held-out board; registered: after the mean place error of the board is subtracted."""
+    registered = {metric: f"{title} (registered)" for metric, title in PLACES.items()}
+    return pd.DataFrame(
+        {"held-out board": board, "training skins": str(row["trained_on_skins_n"])}
+        | cells(row["as_labelled"])
+        | cells(row["registered"], registered)
+        for board, row in numbers["lobo"]["by_board"].items()
+    )
+
+
+@of("variants")
+def variants(numbers: Numbers) -> pd.DataFrame:
+    """Scores of every recipe of the experiments that have several."""
+    return pd.DataFrame(
+        {"experiment": experiment, "recipe": recipe} | scored(row)
+        for experiment, recipes in numbers["variants"].items()
+        for recipe, row in recipes.items()
+        if len(recipes) > 1
+    )
+
+
+@of("new_board")
+def new_board(numbers: Numbers) -> pd.DataFrame:
+    """Scores of the in-context models on boards never seen, by number of labels."""
+    return pd.DataFrame(
+        {"method": TITLES[row["method"]], "split": row["split"], "presses without labels": row["pokes_n"]}
+        | {"labels": row["labels_n"]}
+        | cells(row, NEW_BOARD)
+        | {"within 1 mm, minus shipped": _over_draws(row.get("minus_shipped", {}).get("accuracy_pct"))}
+        for row in numbers["new_board"]
+        if row["method"] != "contact"
+    )
+
+
+def _over_draws(difference: Numbers | None) -> str | None:
     """Write a paired difference with its standard deviation over draws."""
     if difference is None:
-        return "–"
+        return None
     return f"{difference['mean']:+.1f}" + (f" ± {difference['sd_draws']:.1f}" if "sd_draws" in difference else "")
 
 
-def new_board_contact_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List missed and false contacts by the age of the no-load reading."""
-    lines = [
-        {"no-load reading": NOLOAD_AGES[row["split"]]}
-        | {title: show(row[metric]) for metric, title in CONTACT.items()}
-        | {"source": source}
-        for row in rows
-        if row["method"] == "contact"
-    ]
+@of("new_board")
+def new_board_contact(numbers: Numbers) -> pd.DataFrame:
+    """Missed and false contacts by the age of the no-load reading."""
+    rows = [row for row in numbers["new_board"] if row["method"] == "contact"]
+    return pd.DataFrame({"no-load reading": NOLOAD_AGES[row["split"]]} | cells(row, CONTACT) for row in rows)
+
+
+@of("compare")
+def compare(numbers: Numbers) -> pd.DataFrame:
+    """How each recorded board is oriented, and how well each simulation agrees with it."""
+    lines = []
+    for board, row in numbers["compare"]["by_board"].items():
+        simulated = {title: row if name == "fitted" else row.get(name, {}) for name, title in SIMULATIONS.items()}
+        agreed: dict[str | None, Numbers] = {title: one for title, one in simulated.items() if "cosine_mean" in one}
+        for simulation, one in (agreed or {None: {}}).items():
+            growth = one.get("growth", {})
+            shown = {"cosine": one.get("cosine_mean"), "explained": one.get("explained_median")}
+            shown |= {"growth": growth.get("simulated"), "growth, recorded": growth.get("recorded")}
+            line = {title: value if value is None else f"{value:.2f}" for title, value in shown.items()}
+            orientation = {"orientation": row["frames"]["sentence"]}
+            lines.append({"board": board, "simulation": simulation} | line | orientation)
     return pd.DataFrame(lines)
 
 
-def drift_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List accuracy and one error by the number of earlier contacts, for each no-load policy."""
-    policies = policies_in(numbers)
-    first = next(iter(policies))
-    error = "mse_f_N2" if "mse_f_N2" in numbers[first][0] else "mse_xy_mm2"
+@of("provenance")
+def single_sensor(numbers: Numbers) -> pd.DataFrame:
+    """Scores on one skin by what was held out, beside the paper's, and of controls that do not use a touch."""
+    lines, hover = [], numbers.get("hover", {})
+    for experiment, held_out in SPLITS.items():
+        if experiment not in numbers:
+            continue
+        by_skin = numbers.get("single_skins", {}) if experiment == "single_temporal" else {}
+        for skin, row in (by_skin or {None: numbers[experiment]}).items():
+            seen = hover[skin]["seen"] if skin in hover else any(one["seen"] for one in hover.values())
+            line = {"held out": held_out, "skin": skin, "predicted from": "field change"}
+            lines.append(line | scored(row, {} if seen else paper.SINGLE_SENSOR, show_with_sd))
+        for method, row in numbers.get("before_touch", {}).get(experiment, {}).items():
+            lines.append({"held out": held_out, "predicted from": BEFORE_TOUCH[method]} | scored(row, {}, show_with_sd))
+        for skin, row in hover.items() if experiment == "single_temporal" else ():
+            for method, title in HOVER.items():
+                line = {"held out": held_out, "skin": skin, "predicted from": f"hovering tip, {title}"}
+                lines += [line | scored(row[method])] if method in row else []
+    return pd.DataFrame(lines)
+
+
+@of("variation")
+def variation(numbers: Numbers) -> pd.DataFrame:
+    """Differences between the fields of equal indentations, over time and between skins (figure 4)."""
     lines = []
-    for i, window in enumerate(numbers[first]):
-        line = {"contacts": f"{window['contacts_n']:,}", "source": source}
-        for policy, title in policies.items():
-            row = numbers[policy][i]
-            for metric in ("accuracy_pct", error):
-                stat = Stat(row[metric], numbers["skins_n"] * numbers["seeds_n"], row["spread"].get(metric))
+    for place in numbers["variation"]["places"]:
+        time, skins = place["time"], place["skins"]
+        over = [("pokes over time", time["visits_n"], "as read", time["raw_change_uT"], time["raw_change_pct"])]
+        over += [("pokes over time", time["visits_n"], "change", time["db_change_uT"], time["db_change_pct"])]
+        if "spread_uT" in skins:
+            over += [("skins", len(skins["skins"]), "change", skins["spread_uT"], skins["spread_pct"])]
+        lines += [
+            {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "between": between, "n": str(n), "field": field}
+            | {"difference, µT": show(rms_uT), "difference, % of the change": show(pct)}
+            for between, n, field, rms_uT, pct in over
+        ]
+    return pd.DataFrame(lines)
+
+
+@of("drift")
+def drift(numbers: Numbers) -> pd.DataFrame:
+    """Scores by the number of earlier contacts, for each policy of no-load readings (figure 5)."""
+    found = numbers["drift"]
+    policies, lines = policies_in(found), []
+    for windows in zip(*(found[policy] for policy in policies), strict=True):
+        line = {"contacts": f"{windows[0]['contacts_n']:,}"}
+        for title, row in zip(policies.values(), windows, strict=True):
+            for metric in ("accuracy_pct", "mse_f_N2" if "mse_f_N2" in row else "mse_xy_mm2"):
+                stat = Stat(row[metric], found["skins_n"] * found["seeds_n"], row["spread"].get(metric))
                 line[f"{COLUMNS[metric]} ({title})"] = show(stat)
         lines.append(line)
-    return tabulate(lines, spread="± is the standard deviation over networks, which differ in their seed or skin.")
-
-
-def audit_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the checks for leaks of test data; a known and documented leak is marked as such."""
-    lines = [
-        {name: str(row[name]) for name in ("what", "where", "rule", "found")}
-        | {"holds": "yes" if row["holds"] else "no, known" if row["known"] else "NO", "source": source}
-        for row in rows
-    ]
-    return tabulate(lines)
-
-
-def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidate settings of each stage, and mark the chosen settings.
-
-    The chosen settings had the best scores in a cross-validation that leaves one board out. The boards of this
-    cross-validation are not used for other results.
-    """
-    lines = [
-        {
-            "stage": stage,
-            "candidate": row["recipe_name"],
-            "settings": row["settings"],
-            "chosen": f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else "",
-            "source": source,
-        }
-        | scored(row)
-        for stage, choice in choices.items()
-        for row in choice["candidates"]
-    ]
-    return tabulate(lines, meaning=BUDGETS, spread=OVER_BOARDS)
-
-
-def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in the paper's order; only ours has a control and a constant force."""
-    rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
-    constant = numbers.get("constant_force", {}).get("table2")
-    if constant:
-        rows[CONSTANT] = (constant, {})
-    table = _beside_paper(rows, source)
-    trainings = numbers.get("trainings", {})
-    kept_n = sum(trainings[name]["kept_collapsed_n"] for name in scenes.TABLE_2.values() if name in trainings)
-    meaning = [TARGET] * (source == "simulated")
-    if kept_n:
-        meaning.append(
-            f"{kept_n} networks collapsed (their output is nearly constant) in each of their training runs. They are "
-            "included in these means."
-        )
-    table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(meaning)} if meaning else {})
-    return table
-
-
-def _single(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate each split of one skin beside the paper's scores, and positions predicted without the field change."""
-    rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
-    seen = [skin for skin, own in numbers.get("hover", {}).items() if own["seen"]]
-    for name, split in SPLITS.items():
-        if name in numbers:
-            skins = numbers.get("single_skins", {}) if name == "single_temporal" else {}
-            own = {f"{split}: {skin}": (_stats(scores), skin in seen) for skin, scores in skins.items()}
-            own = own or {split: (numbers[name], bool(seen))}
-            rows |= {title: (scores, {} if of_seen else SINGLE_SENSOR) for title, (scores, of_seen) in own.items()}
-            before = numbers.get("before_touch", {}).get(name, {})
-            rows |= {
-                f"{split}: position from {BEFORE_TOUCH[by]}": (before[by], {}) for by in BEFORE_TOUCH if by in before
-            }
-    table = _beside_paper(rows, source)
-    meaning = [BEFORE_TOUCH_MEANING] if "before_touch" in numbers else []
-    if seen:
-        meaning.append(f"{SEEN_TIP} (see table hover for {', '.join(seen)}).")
-    if meaning:
-        table.attrs["meaning"] = " ".join(meaning)
-    return table
-
-
-def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List, by skin, the scores of a hovering tip's predicted position beside the scores of contacts."""
-    skins, lines = numbers.get("single_skins", {}), []
-    for skin, hover in numbers["hover"].items():
-        contact = skins.get(skin, _means(numbers["single_temporal"]))
-        line = {"skin": skin, "source": source, "contacts, within 1 mm, %": f"{contact['accuracy_pct']:.3g}"}
-        line |= {
-            f"no contact, within 1 mm, % ({model})": f"{hover[key]['accuracy_pct']:.3g}" if key in hover else "–"
-            for key, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
-        }
-        line |= {"|dB| without contact, µT": f"{hover['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{hover['touch_uT']:.3g}"}
-        lines.append(line | {"tip sensed without contact": "yes" if hover["seen"] else "no"})
-    return tabulate(lines, meaning=HOVER_MEANING)
-
-
-def _stats(scores: Mapping[str, float]) -> dict[str, Any]:
-    return {name: {"mean": value, "n": 1} for name, value in scores.items()}
-
-
-def _means(row: Mapping[str, Any]) -> dict[str, float]:
-    return {name: stat["mean"] for name, stat in row.items() if isinstance(stat, Mapping) and "mean" in stat}
-
-
-def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
-    lines = [
-        {"model": name, "source": source} | beside(ours, printed(paper), show_both)
-        for name, (ours, paper) in rows.items()
-    ]
     return pd.DataFrame(lines)
 
 
-def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
-    places = {
-        "as_labelled": "as predicted",
-        "registered": "corrected by one offset per board, from its labels (a diagnosis)",
-    }
-    lines = [
-        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "positions": title}
-        | {"source": source}
-        | {name: f"{parts[part][metric]:.3g}" for metric, name in COLUMNS.items() if metric in parts[part]}
-        for board, parts in by_board.items()
-        for part, title in places.items()
-    ]
-    return pd.DataFrame(lines)
+@of("sweep_pokes")
+def sweep_pokes(numbers: Numbers) -> pd.DataFrame:
+    """Scores by number of pokes of the new skin (figure 6a), beside two rows of the paper's table 2."""
+    printed = {0: paper.TABLE_2["triplet"], paper.ADAPTED_POKES_N: paper.TABLE_2["adapted"]}
+    rows = sorted(numbers["sweep_pokes"], key=lambda row: row["pokes_n"])
+    return pd.DataFrame({"pokes": str(row["pokes_n"])} | scored(row, printed.get(row["pokes_n"], {})) for row in rows)
 
 
-def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
-    """Count, for each experiment, all training runs, collapsed training runs, and collapsed networks that were kept."""
-    columns = {
-        "training runs": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
-    }  # fmt: skip
-    lines = [
-        {"experiment": experiment, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
-        for experiment, counted in counts.items()
-    ]
-    return tabulate(lines, meaning=COLLAPSED_MEANING)
-
-
-def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
-    lines = [
-        {"experiment": experiment, "recipe": recipe, "source": source} | scored(row)
-        for experiment, recipes in variants.items()
-        for recipe, row in recipes.items()
-    ]
-    return pd.DataFrame(lines)
-
-
-def final_model_table(numbers: Numbers) -> pd.DataFrame:
-    """Describe the model that was trained on all boards, how to use it, and the scores on held-out boards."""
-    model, source = numbers["final_model"], numbers["provenance"]["source"]
-    row, held_out = table_2_rows(numbers)["multi"]
-    file = model["file"]
-    trained_on = f"{model['boards_n']} {source} boards, {model['skins_n']} skins, {model['rows_n']:,} readings"
-    scores_of = {title: show(held_out[metric]) for metric, title in COLUMNS.items() if metric in held_out}
-    rows = {
-        "file": f"{file}; a JSON file with the same name describes the model",
-        "trained on": f"{trained_on}; {model['steps_n']} steps",
-        "tested": "no, because all boards were in training. Scores of networks that were trained in the same way, on "
-        f"{n_of(held_out)} held-out boards (row {row.title} of table 2): "
-        + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
-        "use with a log": f"reskin predict LOG.csv --model {file} --out contacts.csv",
-        "use with a board": f"reskin live --model {file}",
-        "use in Python": f'model = reskin.load_model("{file}").zero(noload_uT); model.predict(b_uT)',
-        "use without Python": 'model.export_onnx("model.onnx")',
-    }
-    if source == "simulated":
-        rows["limits"] = f"The model was trained on simulated skins, and not tested on real skins. {SHIPPED}"
-    elif not model["forces_known"]:
-        rows["limits"] = f"The recordings contain no forces, so every force that the model predicts is NaN. {SHIPPED}"
-    else:
-        rows["limits"] = f"Compare its scores with those of the shipped model before you use it. {SHIPPED}"
-    return tabulate([{"final model": name, "": text} for name, text in rows.items()], meaning=FINAL_MEANING)
-
-
-def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List counts of read and lost data, for the main captures and for other protocols (without counts of 0)."""
-    others = numbers.get("capture_by_protocol", {})
-    lines = [
-        {"protocol": protocol, "what": what, "count": str(count), "source": source}
-        for protocol, counts in {"main": numbers["capture"], **others}.items()
-        for what, count in _counts(counts).items()
-        if protocol == "main" or count
-    ]
-    meaning = {
-        "meaning": "Protocol main has the captures from which the training and test sets (folds) are made. For all "
-        "other protocols, counts of 0 are not listed."
-    }
-    return tabulate(lines, **(meaning if others else {}))
-
-
-def _counts(protocol_counts: Mapping[str, Any]) -> dict[str, int]:
-    """Return the counts of a protocol as a flat mapping; the counts in entry `left_out` get a prefix."""
-    counts = {name: count for name, count in protocol_counts.items() if name != "left_out"}
-    return counts | {f"left out of training: {name}": count for name, count in protocol_counts["left_out"].items()}
-
-
-def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Tabulate descriptions of skins, with one column per description, by title.
-
-    If some skins are simulated and some are recorded, another column has the ratio simulated / recorded nearest to 1.
-    """
-    both_sources = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
-    lines = []
-    for name, title in QUANTITIES.items():
-        values = {column: described["over_skins"].get(name) for column, described in columns.items()}
-        if not any(values.values()):
-            continue
-        line = {"quantity": title} | {
-            column: f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})" if value else "–"
-            for column, value in values.items()
-        }
-        if both_sources:
-            means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
-            ratios = [
-                a / b
-                for source_a, a in means
-                if source_a == "simulated"
-                for source_b, b in means
-                if source_b == "recorded"
-            ]
-            nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)), default=None)
-            line["simulated / nearest recorded"] = "–" if nearest is None else f"{nearest:.2g}"
-        lines.append(line)
-    return tabulate(lines, meaning=SKINS_MEANING)
-
-
-def table_2_summary(numbers: Numbers) -> pd.DataFrame:
-    """Tabulate the main scores on held-out boards, with the paper's means in parentheses."""
-    lines = []
-    for model, row in table_2_rows(numbers).values():
-        line = {HELD_OUT: model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")}
-        for metric, title in COLUMNS.items():
-            paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""
-            line[f"{title} (paper)" if metric in PAPER_METRICS else title] = show(row.get(metric)) + paper
-        lines.append(line | {"n": n_of(row)})
-    return tabulate(lines, spread=SUMMARY_SPREAD)
-
-
-def new_board_summary(numbers: Numbers) -> pd.DataFrame:
-    """Tabulate the in-context models' scores on held-out boards with the fewest and the most labels."""
-    rows = unseen_rows(numbers)
-    ends = sorted({min(row["labels_n"] for row in rows), max(row["labels_n"] for row in rows)})
-    by_method = {(row["method"], row["labels_n"]): row for row in rows}
-    lines = [
-        {HELD_OUT: TITLES[method]}
-        | {
-            f"{title}, {labels_n} labels": show(by_method[method, labels_n].get(metric))
-            for metric, title in SUMMARY_TITLES.items()
-            for labels_n in ends
-        }
-        for method in dict.fromkeys(row["method"] for row in rows)
-    ]
-    return tabulate(lines, spread=INTERVAL)
-
-
-def summary_table(numbers: Numbers) -> pd.DataFrame | None:
-    """Tabulate a scene's main scores on held-out boards; None if no board was held out."""
-    if unseen_rows(numbers):
-        return new_board_summary(numbers)
-    return table_2_summary(numbers) if numbers.get("table2") else None
-
-
-def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List the paired differences between models, beside the differences of the paper's means."""
-    known = models(numbers)
-    lines = []
-    for row in numbers["paired"]:
-        first, second = known[row["of"]].paper, known[row["over"]].paper
-        gains = {m: f"{first[m][0] - second[m][0]:+.4g}" for m in first if m in second and first != second}
-        cells = beside(row, gains, show_difference, paper="paper: difference of means")
-        lines.append({"difference": _difference_of(row, known), "source": source} | cells)
-    return tabulate(lines, spread=PAIRED)
-
-
-def paired_boards_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List the paired differences between models on each held-out board."""
-    known = models(numbers)
-    lines = [
-        {"difference": _difference_of(row, known), "held-out board": board, "source": source}
-        | {title: show_difference({"mean": means[m]}) for m, title in COLUMNS.items() if m in means}
-        for row in numbers["paired"]
-        for board, means in row.get("by_board", {}).items()
-    ]
-    return tabulate(lines, spread=PAIRED)
-
-
-def _difference_of(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:
-    return f"{known[row['of']].short} − {known[row['over']].short}"
-
-
-def extremes_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List laws of physics and stiff, extreme and broken cases with the error, the allowed error and its reason."""
-    lines = [
-        {title: _with_unit(row[name], row["unit"]) for name, title in CASES.items()}
-        | ({"error": row["message"]} if row["message"] else {})
-        | {"holds": "yes" if row["holds"] else "NO", "source": source}
-        for row in numbers["cases"]
-    ]
-    return tabulate(lines)
-
-
-def accuracy_and_cost_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List the errors of methods and of neglected terms; the run times are shown if they were measured."""
-    timed = any("seconds" in row for row in numbers["rows"])
-    lines = [
-        {name: row[name] for name in ("study", "method", "setting")}
-        | {"error": _with_unit(row["error"], row["unit"])}
-        | ({"run time, s": f"{row['seconds']:.2g}" if "seconds" in row else "–"} if timed else {})
-        | {"source": source}
-        for row in numbers["rows"]
-    ]
-    return tabulate(lines)
-
-
-def _with_unit(value: str | float | None, unit: str) -> str:
-    if value is None or isinstance(value, str):
-        return value or "failed"
-    return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
-
-
-def run_tables(numbers: Numbers, source: str) -> dict[str, pd.DataFrame]:
-    """Make the tables that differ between repeats of a run: errors against run times, and the cost of each stage."""
-    rows = timed_rows(numbers)
-    tables = {"accuracy_and_cost": accuracy_and_cost_table({"rows": rows}, source)} if rows else {}
-    lines = [
-        {
-            "stage": stage,
-            "computed, s": f"{cost['computed_s']:.1f}",
-            "last run, s": f"{cost['seconds']:.1f}",
-            "last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # missing in older records of costs
-            "training runs": str(cost["trainings_n"]),
-            "reused training runs": str(cost["reused_n"]),
-            "peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}",
-        }
-        for stage, cost in numbers["runtime"]["stages"].items()
-    ]
-    return tables | {"stages": tabulate(lines, meaning=COMPUTED)}
-
-
-class Table1(Strict):
-    """Table 1 of the paper: the source that the paper cites for each column, and the cells of each row."""
-
-    columns: dict[str, str]
-    rows: dict[str, tuple[str, ...]]
-
-    @model_validator(mode="after")
-    def _rows_fill_the_columns(self) -> "Table1":
-        for name, cells in self.rows.items():
-            if len(cells) != len(self.columns):
-                raise ValueError(f"row {name!r} must have {len(self.columns)} cells, not {len(cells)}")
-        return self
-
-
-def read_table1(path: Path = TABLE_1) -> Table1:
-    """Read the paper's table 1 from its YAML file."""
-    return parse(Table1, read_yaml(path), str(path))
-
-
-def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
-    """Add our column (`measured`, by row) to the paper's table 1, whose cells remain as printed.
-
-    A row for the localisation is added if we have a result for it.
-    """
-    rows = data.rows | ({LOCALISATION: (NOT_GIVEN,) * len(data.columns)} if LOCALISATION in measured else {})
-    if unknown := sorted(measured.keys() - rows.keys()):
-        remedy = "Use names of rows of table 1 (pipeline/report/tables.yaml) in function `measured`."
-        raise ParamsError("table 1", "each row with a result of ours", f"one of {sorted(rows)}", unknown, remedy)
-    lines = [
-        {"property": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
-        for name, cells in rows.items()
-    ]
-    sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())
-    added = "the last column and the last row" if LOCALISATION in measured else "the last column"
-    meaning = (
-        f'The cells are printed as in table 1 of the paper, including "?". We added {added}. '
-        f"Sources of the other columns: {sources}"
+@of("sweep_sensors")
+def sweep_sensors(numbers: Numbers) -> pd.DataFrame:
+    """Scores by number of training skins, for each method (figure 6b)."""
+    rows = sorted(numbers["sweep_sensors"], key=lambda row: (row["skins_n"], list(TITLES).index(row["method"])))
+    return pd.DataFrame(
+        {"training skins": str(row["skins_n"]), "method": TITLES[row["method"]]} | scored(row) for row in rows
     )
-    return tabulate(lines, meaning=meaning)
 
 
-def measured(numbers: Numbers) -> dict[str, str]:
-    """Write our cells of table 1, which are results or settings of the scene; return them by row."""
-    source = numbers["provenance"]["source"]
-    simulated = source == "simulated"
-    described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
-    cells = {}
+@of("shear")
+def shear(numbers: Numbers) -> pd.DataFrame:
+    """Scores of places and all components of the force, beside the paper's."""
+    splits = {"random readings": numbers["shear"], "whole lines": numbers["shear"]["by_line"]}
+    return pd.DataFrame({"held out": split} | cells(row, SHEAR, paper.SHEAR) for split, row in splits.items())
+
+
+@of("manual")
+def manual(numbers: Numbers) -> pd.DataFrame:
+    """Scores before and after adaptation with hand pokes, and the differences on the same skins."""
+    found = numbers["manual"]
+    lines = [
+        {"networks": TITLES[name]} | scored(found[name], paper.MANUAL.get(name, {}))
+        for name in ADAPTATION
+        if name in found
+    ]
+    for pair, difference in found["paired"].items():
+        title = " − ".join(TITLES[name] for name in pair.split("_minus_"))
+        gains = paper.GAINS["by_hand"] if pair == "after_minus_before" else {}
+        printed = {metric: f"{gain:+g}" for metric, gain in gains.items()}
+        lines.append({"networks": title} | scored(difference, printed, show_difference))
+    return pd.DataFrame(lines)
+
+
+@of("flexible")
+def flexible(numbers: Numbers) -> pd.DataFrame:
+    """Scores and force biases on flexible boards, for the paper's inputs and, if they were used, for `shape`."""
+    found = numbers["flexible"]
+    inputs = {"field change": found} | ({"direction and length": found["shape"]} if "shape" in found else {})
+    return pd.DataFrame(
+        {"networks": TITLES[name], "inputs": title}
+        | scored(row[name], paper.FLEXIBLE if name == "after" else {})
+        | {"bias of F, N": show_difference(row["bias_f_N"][name])}
+        | {"bias of F, %": show_difference(row["bias_f_pct"][name])}
+        for title, row in inputs.items()
+        for name in ADAPTATION
+        if name in row
+    )
+
+
+def _of_paper(rows: list[tuple[str, str, Any]]) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=["what", "ours", "paper"])
+
+
+@of("sensitivity")
+def sensitivity(numbers: Numbers) -> pd.DataFrame:
+    """Smallest resolved steps of weight, and how often the mean response rises with the weight."""
+    found = numbers["sensitivity"]
+    rise = found["monotonic"]
+    near = rise["neighbours"]
+
+    def least(steps_N: Numbers, name: str) -> str:
+        """Write the smallest step; if even the finest step was resolved, it is an upper bound."""
+        if name not in steps_N:
+            return f"none up to {found['range_N']:g}"
+        return f"{'≤ ' if steps_N[name] <= found['step_N'] else ''}{steps_N[name]:.3g}"
+
+    rows: list[tuple[str, str, Any]] = []
+    for name, title in READINGS.items():
+        smallest = least(found["smallest_step_N"], name)
+        rows += [
+            (f"smallest resolved step, {title}, N", smallest, f"< {paper.SENSITIVITY_N:g}"),
+            (f"the same, from the size of dB alone, {title}, N", least(found["by_length_N"], name), None),
+        ]
+    return _of_paper([
+        *rows,
+        ("smallest step above the noise, N", show(rise["step_N"]) if "step_N" in rise else "none", None),
+        ("rises over this step", f"{rise['pairs_n'] - rise['falls_n']} of {rise['pairs_n']}", paper.MONOTONIC),
+        ("falls between neighbouring levels", f"{near['falls_n']} of {found['levels_n'] - 1}", None),
+        ("falls expected from noise", f"{near['expected_falls_n']:.1f}" if "expected_falls_n" in near else NONE, None),
+        ("rank correlation of weight and mean response", f"{rise['spearman']:.4f}", None),
+        ("gain, µT/N", show(found["gain_uT_per_N"]), None),
+        ("noise of a reading along the response, µT", f"{found['noise_uT']:.2g}", None),
+    ])  # fmt: skip
+
+
+@of("logs")
+def logs(numbers: Numbers) -> pd.DataFrame:
+    """Contacts found in a log, and scores if the true contacts are known."""
+    found = numbers["logs"]
+    account = found["account"]
+    return _of_paper([
+        ("rate, Hz", f"{found['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
+        ("duration, s", f"{found['duration_s']:.1f}", None),
+        ("readings", str(found["readings_n"]), None),
+        ("readings lost to failed reads and stuck chips", str(account["rows_read_n"] - account["rows_n"]), None),
+        ("frames missing from gaps between times", str(account["gap_frames_n"]), None),
+        *((title, _of_log(found, name), None) for name, title in LOGS.items() if name in found),
+    ])  # fmt: skip
+
+
+@of("logs")
+def logs_turning(numbers: Numbers) -> pd.DataFrame:
+    """The same log, as if the board pitched in the earth's field."""
+    found = numbers["logs"]
+    return pd.DataFrame(
+        {"pitch, °": f"± {row['pitch_deg']:g}", "readings": readings}
+        | {title: _of_log(found | scores, name) for name, title in TURNING.items() if name in found | scores}
+        for row in found.get("turning", ())
+        for readings, scores in (("as logged", row), ("reference chip subtracted", row["reference_chip"]))
+    )
+
+
+def _of_log(row: Numbers, name: str) -> str:
+    """Write a count, or a score with its standard deviation over networks."""
+    if isinstance(row[name], int):
+        return str(row[name])
+    spread = row.get("spread", {})
+    return f"{row[name]:.3g}" + (f" ± {spread[name]:.2g}" if name in spread else "")
+
+
+@of("sleeve")
+def sleeve(numbers: Numbers) -> pd.DataFrame:
+    """Scores of each method on a skin over many boards; n is the number of seeds."""
+    found = numbers["sleeve"]
+    parts = {"near_seam": f"median error < {found['near_mm']:g} mm from a border, mm"}
+    parts |= {"inside": "median error elsewhere, mm"}
+    return pd.DataFrame(
+        {"method": TITLES.get(name, f"network, recipe {name}")}
+        | cells(row, SLEEVE)
+        | {title: show(row[part]["median_error_mm"]) for part, title in parts.items() if part in row}
+        | {"n": str(row["accuracy_pct"]["n"])}
+        for name, row in ({"network": found} | found["variants"]).items()
+    )
+
+
+@of("gripper")
+def gripper(numbers: Numbers) -> pd.DataFrame:
+    """How often and how accurately a gripper held each force, by estimator."""
+    found = numbers["gripper"]
+    within = f"within {found['within_pct']:g} %, % of runs"
+    return pd.DataFrame(
+        {"aim, N": f"{row['aim_N']:g}", "force from": FORCE_FROM[row["feedback"]], "known press": PRESSES[row["press"]]}
+        | {f"mean {within}": f"{row['held_pct']:.0f}", f"always {within}": f"{row['always_pct']:.0f}"}
+        | {"mean error, %": show(row["error_pct"]), "median error, %": f"{row['median_error_pct']:.1f}"}
+        | {"largest error, %": f"{row['worst_error_pct']:.0f}", "runs": str(row["runs_n"])}
+        for row in found["rows"]
+    )
+
+
+@of("interference")
+def interference_contacts(numbers: Numbers) -> pd.DataFrame:
+    """False and detected contacts, for each changing field, method and value of `external_uT`."""
+    rows = numbers["interference"]["contacts"]
+    return pd.DataFrame(_interference(row) | cells(row, INTERFERENCE) for row in rows)
+
+
+@of("interference")
+def interference_places(numbers: Numbers) -> pd.DataFrame:
+    """Scores of places in changing fields, by number of labels of the calibration."""
+    rows = numbers["interference"]["places"]
+    return pd.DataFrame(_interference(row) | {"labels": str(row["labels_n"])} | cells(row, COVERED) for row in rows)
+
+
+def _interference(row: Numbers) -> Line:
+    keys = {"field": row["field"].replace("_", " "), "method": TITLES[row["method"]]}
+    return keys | {"external_uT": f"{row['external_uT']:g}"}
+
+
+@of("provenance")
+def table1(numbers: Numbers) -> pd.DataFrame:
+    """Table 1 of the paper as printed, with a column and a row of ours; empty if we have no cell of it."""
+    ours = _ours_of_table_1(numbers)
+    table = pd.DataFrame(paper.TABLE_1)
+    if LOCALISATION in ours:
+        table.loc[len(table)] = {"property": LOCALISATION}
+    return table.assign(ours=table["property"].map(ours)) if ours else table.head(0)
+
+
+def _ours_of_table_1(numbers: Numbers) -> dict[str, str]:
+    """Write our cells of table 1, which are results or settings of the scene, by row."""
+    cells_of: dict[str, str] = {}
+    described: Numbers = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
     if rate := described["over_skins"].get("rate_hz"):
-        cells["Frequency"] = (
-            f"{three_digits(rate['mean'])} Hz" + ", a setting, computed from the times in the captures" * simulated
-        )
-    if sleeve := numbers.get("sleeve"):
-        area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
-        cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated
-    if drift := numbers.get("drift"):
-        policies = policies_in(drift)
-        policy = "each" if "each" in policies else next(iter(policies))
-        last = drift[policy][-1]
-        cells["Durable (> 50k contacts)"] = (
-            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts (no-load readings: "
-            f"{policies[policy]})"
+        cells_of["Frequency"] = f"{three_digits(rate['mean'])} Hz"
+    if found := numbers.get("sleeve"):
+        width_mm, length_mm = found["area_mm"]
+        cells_of["Area coverage"] = f"{found['chips_n']} chips under {width_mm:g} x {length_mm:g} mm"
+    if found := numbers.get("drift"):
+        policies = policies_in(found)
+        last = found["each" if "each" in policies else next(iter(policies))][-1]
+        cells_of["Durable (> 50k contacts)"] = (
+            f"{show(last['accuracy_pct'])} % within 1 mm after {last['contacts_n']:,} contacts"
         )
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
     if best:
-        accuracy = show_with_unit(numbers["table2"][best]["accuracy_pct"], "%")
-        cells[LOCALISATION] = f"{accuracy} ({models(numbers)[best].short})"
-    return {row: f"{text}, {source}" for row, text in cells.items()}
+        cells_of[LOCALISATION] = f"{show(numbers['table2'][best]['accuracy_pct'])} % ({models(numbers)[best].short})"
+    return cells_of
+
+
+@of("final_model")
+def final_model(numbers: Numbers) -> pd.DataFrame:
+    """What the model that was trained on all boards was made from."""
+    found = numbers["final_model"]
+    counts = {"boards": "boards_n", "skins": "skins_n", "readings": "rows_n", "training steps": "steps_n"}
+    return pd.DataFrame([{"file": found["file"]} | {title: f"{found[name]:,}" for title, name in counts.items()}])
+
+
+@of("chosen")
+def chosen(numbers: Numbers) -> pd.DataFrame:
+    """Candidate settings of each stage, scored by cross-validation over boards that have no other use."""
+    return pd.DataFrame(
+        {"stage": stage, "candidate": row["recipe_name"], "settings": row["settings"]}
+        | {"chosen": f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else ""}
+        | scored(row)
+        for stage, choice in numbers["chosen"].items()
+        for row in choice["candidates"]
+    )
+
+
+@of("extremes")
+def extremes(numbers: Numbers) -> pd.DataFrame:
+    """Laws of physics and stiff, extreme and broken cases: error, allowed error and its reason."""
+    return pd.DataFrame(
+        {"area": row["area"], "what": row["what"], "compared with": row["reference"]}
+        | {"error": row["message"] or _with_unit(row["error"], row["unit"])}
+        | {"allowed": _with_unit(row["limit"], row["unit"]), "reason": row["reason"]}
+        | {"holds": "yes" if row["holds"] else "NO"}
+        for row in numbers["extremes"]["cases"]
+    )
+
+
+@of("accuracy_and_cost")
+def accuracy_and_cost(numbers: Numbers) -> pd.DataFrame:
+    """Errors of numerical methods and of neglected terms; with run times if they were measured."""
+    return pd.DataFrame(
+        {name: row[name] for name in ("study", "method", "setting")}
+        | {"error": _with_unit(row["error"], row["unit"])}
+        | {"run time, s": f"{row['seconds']:.2g}" if "seconds" in row else None}
+        for row in numbers["accuracy_and_cost"]["rows"]
+    )
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return "failed" if value is None else f"{value:.2g} {unit}".removesuffix(" 1")
+
+
+@of("audit")
+def audit(numbers: Numbers) -> pd.DataFrame:
+    """Checks for leaks of test data, counted by experiment; a leak that the paper's protocol has is known."""
+    checks = pd.DataFrame(
+        {"what": row["what"], "experiment": re.split("[/.]", row["where"])[0], "rule": row["rule"]}
+        | {"holds": "yes" if row["holds"] else "no, known" if row["known"] else "NO", "found": str(row["found"])}
+        for row in numbers["audit"]
+    )
+    groups = checks.groupby(["what", "experiment", "rule", "holds"], sort=False)["found"]
+    return groups.agg(checks="size", found="first").reset_index().rename(columns={"found": "found, for example"})
+
+
+@of("described")
+def skins(numbers: Numbers) -> pd.DataFrame:
+    """Field, noise, resolution and forces of the readings, over skins."""
+    (described,) = numbers["described"].values()
+    found = {title: described["over_skins"].get(name) for name, title in SKINS.items()}
+    return pd.DataFrame(
+        {"quantity": title, "mean": show(row["mean"]), "least": show(row["least"]), "most": show(row["most"])}
+        | {"skins": str(row["n"])}
+        for title, row in found.items()
+        if row
+    )
+
+
+@of("capture")
+def captures(numbers: Numbers) -> pd.DataFrame:
+    """Counts of read and lost data: one column per protocol."""
+    protocols = {"main": numbers["capture"]} | numbers.get("capture_by_protocol", {})
+    columns = {}
+    for protocol, counts in protocols.items():
+        counted = {name: count for name, count in counts.items() if name != "left_out"}
+        counted |= {f"left out of training: {name}": count for name, count in counts["left_out"].items()}
+        titled = {name.removesuffix("_n").replace("_", " "): count for name, count in counted.items()}
+        columns[protocol] = pd.Series(titled, dtype=object)
+    return pd.DataFrame(columns).rename_axis("what").reset_index()
+
+
+@of("provenance")
+def claims(numbers: Numbers) -> pd.DataFrame:
+    """One verdict on each claim of the paper; empty if the scene tests none."""
+    table = evaluate(numbers, read_claims())
+    return table.head(0) if set(table["verdict"]) <= {NOT_RUN, NOT_TESTABLE} else table
+
+
+def stages(numbers: Numbers) -> pd.DataFrame:
+    """Cost of each stage. Computed: all its results from nothing, one training run after another."""
+    return pd.DataFrame(
+        {"stage": stage, "computed, s": f"{cost['computed_s']:.1f}", "last run, s": f"{cost['seconds']:.1f}"}
+        | {"last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else None}
+        | {"training runs": str(cost["trainings_n"]), "reused": str(cost["reused_n"])}
+        | {"peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}"}
+        for stage, cost in numbers["runtime"]["stages"].items()
+    )

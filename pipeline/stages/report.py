@@ -10,7 +10,7 @@ import pandas as pd
 from pipeline import PLAN
 from pipeline.catalogue import stages
 from pipeline.experiments import accuracy_and_cost
-from pipeline.formatting import rounded, to_markdown
+from pipeline.formatting import rounded
 from pipeline.provenance import (
     COSTS,
     SECONDS,
@@ -34,7 +34,7 @@ from pipeline.report.numbers import (
     timed_rows,
 )
 from pipeline.report.page import index_page, run_page, scene_page
-from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
+from pipeline.report.tables import make_tables, run_tables, table_texts
 from pipeline.scenes import TABLE_2, Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
@@ -57,9 +57,10 @@ def table2(settings: Settings, scores: Path, tables: Path) -> None:
     table = read_scores(scores / f"{stage}.parquet" for stage in stages(TABLE_2.values(), "models"))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
     numbers = rounded(numbers)
-    text = to_markdown(table_2_summary(numbers))
-    io.write_texts(tables, {"table2.md": text, **score_figures(numbers, source)})
-    say(f"{name} ({source})\n{text}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
+    table_2 = make_tables(numbers)["table2"]
+    io.write_texts(tables, table_texts({"table2": table_2}) | score_figures(numbers, source))
+    files = ", ".join(str(file) for file in sorted(tables.iterdir()))
+    say(f"{name} ({source})\n{table_2.to_string(index=False)}\n{name}: {files}")
 
 
 def report(
@@ -88,7 +89,7 @@ def report(
     io.write_text(reports / "index.html", scene_page(shared, tables, drawn))
     # Seconds, commit and machine differ between equal runs, so this page is not an output of the DVC stage.
     timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, scene.source)
-    io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers, scene.source), timed))
+    io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers), timed))
     write_index(reports.parent)
     say(f"{name}: {accuracies(numbers)}open {reports}/index.html in a browser; training runs: make ui")
 

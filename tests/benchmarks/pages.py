@@ -7,7 +7,6 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.formatting import to_markdown
 from reskin import io
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,7 +26,7 @@ def write_block(page: str, name: str, parts: Sequence[str]) -> None:
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format rows as a Markdown table; missing values become dashes."""
     frame = pd.DataFrame(rows).fillna("–").astype(str)
-    return to_markdown(frame)
+    return str(frame.to_markdown(index=False, disable_numparse=True)) + "\n"
 
 
 def short(value: float) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.compare import agreement, compare_boards, figures
-from pipeline.report.tables import compare_table
+from pipeline.report.tables import compare
 from reskin.recordings.readers import lab
 from reskin.universal.law import TEN, fit, simulate_uT
 from reskin.universal.presses import RecordedPresses, pool, thin
@@ -44,7 +44,7 @@ def test_orientation_is_checked_on_every_board(compared):
 
 def test_table_and_figure_show_every_board(compared):
     numbers, drawn = compared
-    table = compare_table(numbers, "recorded")
+    table = compare({"compare": numbers})
     assert table["board"].tolist() == ["b1"] * 3 + ["b2"] * 3 + ["b3"]
     texts = texts_of(figures(numbers, drawn, "recorded")["compare_growth.svg"])
     assert "b2" in texts

@@ -14,7 +14,7 @@ from scipy.stats import linregress, sem
 
 from pipeline.experiments import drift as experiment
 from pipeline.experiments.drift import Drift, claims, cut, drift, figures, force_left_pct, run, summarise
-from pipeline.report.tables import drift_table
+from pipeline.report import tables
 from pipeline.scores import make_table, read_scores
 from pipeline.settings import Settings, read_shared_files
 from pipeline.statistics import as_json
@@ -285,6 +285,6 @@ def test_errors_are_largest_with_the_no_load_reading_from_the_start_if_the_skin_
     assert last["initial"] > 2 * max(last["regular"], last["each"])
     assert len(results["drawn"]["late"]["true_N"]) == content["late"]["indentations_n"] == 30
     assert set(figures(content, results["drawn"], "simulated")) == {"drift.svg", "drift_force.svg"}
-    table = drift_table(content, "simulated")
+    table = tables.drift({"drift": content})
     assert table["contacts"].tolist() == ["100", "200", "300"]
-    assert all("±" in cell for cell in table["accuracy, % (every 20 indentations)"])
+    assert all("±" in cell for cell in table["within 1 mm, % (every 20 indentations)"])

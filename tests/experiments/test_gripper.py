@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.experiments import gripper
 from pipeline.experiments.gripper import Finger, Gripper, Press, hold, hold_all, judge, scale_to_press
-from pipeline.report.experiment_tables import TABLES
+from pipeline.report import tables
 from reskin.seeds import rng_for
 
 FORCE_N = np.linspace(0, 3, 31)
@@ -71,5 +71,5 @@ def test_results_have_a_row_for_each_aim_and_kind_of_feedback():
     ]  # fmt: skip
     assert [row["runs_n"] for row in numbers["rows"]] == [2] * 5
     assert numbers["rows"][0]["held_pct"] == 100
-    assert len(TABLES["gripper"](numbers, "simulated")["gripper"]) == 5
+    assert len(tables.gripper({"gripper": numbers})) == 5
     assert "0.5 N" in gripper.figures(numbers, figure_data, "simulated")["gripper.svg"]

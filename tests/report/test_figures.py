@@ -17,7 +17,7 @@ from pipeline.report.figures import (
     sweep_sensors,
     unseen_rows,
 )
-from pipeline.report.table_2 import models
+from pipeline.report.tables import models
 from tests.report.synthetic import all_experiments, new_board, texts_of
 
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)

@@ -1,39 +1,102 @@
-"""Tests of the tables in the report, which contain our numbers, those of the paper, and the source of the data."""
+"""Tests of tables: their cells are the numbers of numbers.json, beside those of the paper."""
 
-import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.formatting import PAPER_METRICS, TITLES, rounded, show, show_digits, to_markdown
-from pipeline.paper import TABLE_2
-from pipeline.report.figures import IN_CONTEXT
-from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
-from pipeline.report.readme import fill
-from pipeline.report.table_2 import CONTROL, models
-from pipeline.report.tables import (
-    HELD_OUT,
-    LOCALISATION,
-    NOT_GIVEN,
-    OURS,
-    accuracy_and_cost_table,
-    extremes_table,
-    make_tables,
-    measured,
-    read_table1,
-    run_tables,
-    skins_table,
-    summary_table,
-    table1,
-)
+from pipeline import paper
+from pipeline.formatting import NONE, rounded, show, show_with_sd
+from pipeline.report import tables
+from pipeline.report.numbers import add_up, before_touch_numbers, join, learning_numbers, lost_by_protocol
+from pipeline.report.tables import LOCALISATION, TABLES, make_tables, run_tables, table_texts
 from pipeline.scores import make_table, rows_of_cards
 from pipeline.statistics import as_json
-from reskin.errors import ParamsError, SchemaError
+from reskin import io
+from reskin.code import ROOT
 from tests.report import synthetic
-from tests.report.synthetic import all_experiments, cost, new_board, stat
+from tests.report.synthetic import cost, over_boards
+
+SCENES = sorted(file.parent.name for file in (ROOT / "reports").glob("*/numbers.json"))
+PROVENANCE = {"source": "simulated", "scene": "x"}
+
+
+def committed(scene: str) -> dict:
+    return io.read_json(ROOT / "reports" / scene / "numbers.json")
+
+
+def first_number(cell: str) -> float:
+    return float(cell.partition(" ")[0])
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene(request) -> tuple[dict, dict[str, pd.DataFrame]]:
+    numbers = committed(request.param)
+    return numbers, make_tables(numbers)
+
+
+def test_tables_of_committed_scenes_are_whole(scene):
+    numbers, made = scene
+    needed = {key for key, _ in TABLES.values()} & numbers.keys() - {"provenance", "variants"}
+    for key in needed:
+        assert made.keys() & {name for name, (of, _) in TABLES.items() if of == key}
+    for name, table in made.items():
+        assert len(table), name
+        assert table.columns.is_unique
+        assert table.notna().all(axis=None)
+        assert not (table == NONE).all().any()  # no column without a value
+    assert all(text.count("\n") > 1 for text in table_texts(made).values())
+
+
+def test_cells_are_the_numbers_of_the_scene(scene):
+    numbers, made = scene
+    shown = {
+        "table2": [row["accuracy_pct"] for row in numbers.get("table2", {}).values()],
+        "sweep_pokes": [row["accuracy_pct"] for row in numbers.get("sweep_pokes", ())],
+        "new_board": [row["accuracy_pct"] for row in numbers.get("new_board", ()) if "accuracy_pct" in row],
+        "interference_places": [row["accuracy_pct"] for row in numbers.get("interference", {}).get("places", ())],
+        "manual": [
+            numbers[name][part]["accuracy_pct"]
+            for name, part in (("manual", "before"), ("manual", "after"))
+            if name in numbers
+        ],
+        "lobo_boards": [
+            {"mean": row["as_labelled"]["accuracy_pct"]}
+            for row in numbers.get("lobo", {"by_board": {}})["by_board"].values()
+        ],
+    }
+    for name in shown.keys() & made.keys():
+        cells = [cell for cell in made[name]["within 1 mm, %"] if cell != NONE]
+        means = [stat["mean"] for stat in shown[name]]
+        np.testing.assert_allclose([first_number(cell) for cell in cells[: len(means)]], means, atol=0.5)
+
+
+def test_run_has_a_table_of_the_cost_of_each_stage():
+    made = run_tables({"runtime": {"stages": {"train_multi": cost(seconds=0.25)}}})
+    assert list(made) == ["stages"]
+    (line,) = made["stages"].to_dict("records")
+    assert (line["computed, s"], line["last run, s"]) == ("3.0", "0.2")
+    assert "last run, CPU s" not in line
+    quick = join(committed("quick"), io.read_json(ROOT / "reports/quick/provenance.json"))
+    assert "run time, s" in run_tables(quick)["accuracy_and_cost"]
+    assert "run time, s" not in make_tables(quick)["accuracy_and_cost"]
+
+
+def test_parts_that_a_scene_lacks_have_no_table():
+    capture = {"captures_n": 2, "left_out": {}}
+    assert list(make_tables({"provenance": PROVENANCE, "capture": capture})) == ["captures"]
+    alone = committed("quick")
+    del alone["logs"]["turning"], alone["variation"]["places"][0]["skins"]["spread_uT"]
+    del alone["sleeve"]["near_seam"]
+    for row in alone["sleeve"]["variants"].values():
+        row.pop("near_seam", None)
+    made = make_tables(alone)
+    assert "logs_turning" not in made
+    assert not any("border" in column for column in made["sleeve"])
+    assert made["variation"].iloc[2]["between"] != "skins"
 
 
 def card(experiment: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
@@ -60,7 +123,7 @@ COUNTS = [
 ]
 
 
-def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
+def numbers(cards: list[dict] = CARDS, source: str = "simulated") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
     capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
     return {
@@ -76,50 +139,6 @@ def test_scores_of_table_2_are_means_over_boards_or_pairs_of_skins():
     assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": spread, "values": [80.0, 90.0]}
     pairs = {"mean": 25.0, "n": 2, "sd": spread, "training_n": 1, "boards_n": 1}
     assert table2["single"]["accuracy_pct"] == pairs
-
-
-def test_table_has_scores_of_predictions_from_readings_before_touch():
-    predicted = make_table(
-        {"experiment": "single_temporal", "fold": fold, "method": method, "accuracy_pct": accuracy, "mse_xy_mm2": mse}
-        for fold, method, accuracy, mse in (
-            ("s0", "noload", 10.0, 9.0), ("s0", "scan", 99.0, 0.1),
-            ("s1", "noload", 20.0, 8.0), ("s1", "scan", 97.0, 0.3),
-        )
-    )  # fmt: skip
-    shown = numbers([card("single_temporal", "s0", 95.0)])
-    table = make_tables(shown | as_json(before_touch_numbers(predicted)))["single_sensor"]
-    assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15.0", "98.0"]
-    assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
-    assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
-    assert "do not use the field change" in table.attrs["meaning"]
-    assert len(make_tables(shown)["single_sensor"]) == 1
-
-
-def test_missing_experiment_has_no_table():
-    only_single = numbers([card("single_temporal", "s0", 99.0)])
-    assert "table2" not in only_single
-    assert "lobo" not in only_single
-    assert only_single["single_sensor"]["split"] == "single_temporal"
-    assert "null" not in json.dumps(only_single)
-
-
-def test_split_of_the_paper_is_first_in_the_table():
-    accuracy_by_split = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
-    shown = numbers(
-        [card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in accuracy_by_split.items()]
-    )
-    single = shown["single_sensor"]
-    assert single["split"] == "single_random"
-    means = [one["accuracy_pct"]["mean"] for one in (single, single["by_indentation"], single["by_pass"])]
-    assert means == [90.0, 80.0, 70.0]
-    table = make_tables(shown)["single_sensor"]
-    assert table["accuracy, % (ours)"].tolist() == ["90", "80", "70"]
-    assert all(table["accuracy, % (paper)"] == "99.58 ± 0.34")
-    assert "as in the paper" in table["model"][0]
-
-
-def test_variants_are_in_a_separate_table():
-    assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 
 
 def test_bytes_and_frames_of_all_captures_are_summed():
@@ -141,58 +160,118 @@ def test_lost_bytes_and_rows_are_counted_for_each_protocol():
     assert set(found) == {"wear", "drag"}
     assert found["wear"] == add_up(COUNTS) | {"left_out": {"low_force_rows_n": 4}}
     assert (found["drag"]["captures_n"], found["drag"]["bytes_n"]) == (1, 164)
-    shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index(["protocol", "what"])["count"]
-    assert shown["main", "bytes_n"] == shown["wear", "bytes_n"] == "249"
-    assert shown["drag", "left out of training: low_force_rows_n"] == "7"
-    assert ("drag", "lost_bytes_n") not in shown  # Counts of zero are not shown.
-    assert shown["wear", "lost_bytes_n"] == "3"
+    shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index("what")
+    assert (shown.loc["bytes", "main"], shown.loc["bytes", "drag"], shown.loc["lost bytes", "wear"]) == (249, 164, 3)
+    assert shown.loc["left out of training: low force rows", "drag"] == 7
 
 
-def test_every_row_names_its_source():
-    for source in ("simulated", "recorded"):
-        tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # This table is table 1 of the paper, with one more column for our skin.
-        assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
-        assert any(cell != NOT_GIVEN for cell in ours)
-        for name in tables.keys() - {"claims"}:
-            assert set(tables[name]["source"]) == {source}
+def test_controls_of_one_skin_do_not_use_the_touch():
+    predicted = make_table(
+        {"experiment": "single_temporal", "fold": fold, "method": method, "accuracy_pct": accuracy, "mse_xy_mm2": mse}
+        for fold, method, accuracy, mse in (
+            ("s0", "noload", 10.0, 9.0), ("s0", "scan", 99.0, 0.1),
+            ("s1", "noload", 20.0, 8.0), ("s1", "scan", 97.0, 0.3),
+        )
+    )  # fmt: skip
+    shown = numbers([card("single_temporal", "s0", 95.0)]) | as_json(before_touch_numbers(predicted))
+    table = tables.single_sensor(shown)
+    assert [first_number(cell) for cell in table["within 1 mm, %"]] == [95, 15, 98]
+    assert table["within 1 mm, % (paper)"].dropna().tolist() == ["99.58 ± 0.34"]
 
 
-def test_table_2_contains_the_papers_numbers():
-    text = to_markdown(make_tables(numbers())["table2"])
-    for value in TABLE_2["multi"].values():
-        assert f"{value[0]:g} ± {value[1]:g}" in text  # Numbers have as many digits as in the paper.
-    assert "85.0 ± 7.1" in text
+def test_skin_whose_tip_is_sensed_without_contact_is_not_beside_the_paper():
+    table = make_tables(committed("ini"))["single_sensor"].query("`predicted from` == 'field change'").set_index("skin")
+    assert table.loc["plain", "within 1 mm, % (paper)"] == "99.58 ± 0.34"
+    assert table.loc["screw", "within 1 mm, % (paper)"] == NONE
 
 
-def test_network_of_one_training_skin_is_not_called_pooled():
+def test_only_experiments_with_several_recipes_are_among_the_variants():
+    table = tables.variants(numbers())
+    assert dict(zip(table["recipe"], table["within 1 mm, %"], strict=True)).keys() == {"paper", "released"}
+    assert set(table["experiment"]) == {"lobo"}
+
+
+def test_table_2_has_the_papers_numbers_and_a_control():
+    table = make_tables(committed("paper"))["table2"]
+    for column, metric in (("within 1 mm, %", "accuracy_pct"), ("MSE_F, N²", "mse_f_N2")):
+        printed = ["{:g} ± {:g}".format(*row[metric]) for row in paper.TABLE_2.values()]
+        assert table[f"{column} (paper)"].tolist() == [*printed, NONE, NONE]
+    assert table["model"].tolist()[:4] == list(paper.TABLE_2_ROWS.values())
+
+
+def test_network_of_one_training_skin_is_beside_the_papers_single_sensor():
     alone = numbers([{**one, "train_skins": ["s9"]} for one in CARDS])
-    (row,) = [name for name in make_tables(alone)["table2"]["model"] if "board" in name]
-    assert row == "Leave-one-board-out, one training skin (paper: single-sensor)"
-    assert "84.43" not in to_markdown(make_tables(alone)["table2"])
+    table = tables.table2(alone).set_index("model")
+    printed = table.loc["Leave-one-board-out, one training skin", "within 1 mm, % (paper)"]
+    assert printed == "{:g} ± {:g}".format(*paper.TABLE_2["single"]["accuracy_pct"])
+    pairs = {"paired": [{"of": "triplet", "over": "multi", "accuracy_pct": over_boards()}]}
+    assert "multi" not in tables.paired(alone | pairs)["difference"][0]
 
 
-def test_tables_of_scores_explain_their_metric():
-    tables = make_tables(numbers())
-    assert "within 1 mm" in to_markdown(tables["table2"])
-    assert "within 1 mm" not in to_markdown(tables["captures"])
+def test_paired_differences_are_beside_those_of_the_papers_means():
+    pairs = [("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", "control")]
+    rows = [{"of": of, "over": over, "accuracy_pct": over_boards(-4.4, -2.4)} for of, over in pairs]
+    table = tables.paired({"paired": rows})
+    assert table["within 1 mm, %"].tolist() == ["-3.4 [-4.4, -2.4]"] * 4
+    # The expected differences are those of the paper's means in its table 2, which has no control.
+    assert table["within 1 mm, % (paper)"].fillna("").tolist() == ["+59.19", "-3.4", "+5.97", ""]
 
 
-def test_table_shows_a_dash_for_an_unknown_number():
-    unknown = card("single_temporal", "s0", 99.0)
-    del unknown["scores"]["all"]["mse_f_N2"]
-    table = make_tables(numbers([unknown]))["single_sensor"]
-    assert table["MSE_F, N² (ours)"].tolist() == ["–"]
+def test_gains_by_hand_are_beside_the_papers():
+    table = make_tables(committed("paper"))["manual"].set_index("networks")["within 1 mm, % (paper)"]
+    assert table["before adaptation"] == paper.MANUAL["before"]["accuracy_pct"]
+    assert float(table["after adaptation − before adaptation"]) == paper.GAINS["by_hand"]["accuracy_pct"]
 
 
-def test_standard_deviation_over_seeds_is_shown_with_its_meaning():
+@pytest.mark.parametrize(("step_N", "shown"), [(0.01, "≤ 0.01"), (0.03, "0.03"), (None, "none up to 1")])
+def test_finest_step_of_weight_is_an_upper_bound(step_N, shown):
+    found = committed("paper")["sensitivity"] | {"step_N": 0.01}
+    found["smallest_step_N"] = {"one_reading": step_N} if step_N else {}
+    assert tables.sensitivity({"sensitivity": found})["ours"][0] == shown
+
+
+def test_leak_that_is_not_known_is_highlighted_in_the_audit():
+    check = {"what": "skins", "where": "lobo/b0", "rule": "on one side", "found": 0, "holds": True, "known": False}
+    rows = [check, check | {"where": "lobo/b1"}, check | {"holds": False, "known": True}, check | {"holds": False}]
+    table = tables.audit({"audit": rows})
+    assert dict(zip(table["holds"], table["checks"], strict=True)) == {"yes": 2, "no, known": 1, "NO": 1}
+
+
+def test_chosen_settings_are_marked_among_the_candidates():
+    candidates = [{"recipe_name": name, "settings": "", "mse_f_N2": over_boards()} for name in ("slow", "fast")]
+    choice = {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}
+    table = tables.chosen({"chosen": {"triplet": choice}})
+    assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
+
+
+def test_failed_cases_are_in_the_table_of_extremes():
+    case = {
+        "area": "chip", "what": "field per count", "reference": "data sheet", "error": 3.33e-05, "message": "",
+        "unit": "uT", "limit": 5e-5, "reason": "four decimals", "holds": True,
+    }  # fmt: skip
+    failed = case | {"error": None, "message": "ValueError: no chip", "holds": False}
+    table = tables.extremes({"extremes": {"cases": [case, case | {"unit": "1", "error": 1.5e-3}, failed]}})
+    assert table["error"].tolist() == ["3.3e-05 uT", "0.0015", "ValueError: no chip"]
+    assert table["holds"].tolist() == ["yes", "yes", "NO"]
+
+
+def test_only_reskin_meets_every_requirement_in_table_1():
+    printed = make_tables(committed("paper"))["table1"].set_index("property")
+    requirements = printed.drop(["Type", "Frequency", LOCALISATION]).drop(columns="ours")
+    assert requirements.columns[(requirements == "yes").all()].tolist() == ["ReSkin"]
+    assert printed.loc["Frequency", "ours"] == "400 Hz"
+    assert first_number(printed.loc[LOCALISATION, "ours"]) == pytest.approx(
+        committed("paper")["table2"]["adapted"]["accuracy_pct"]["mean"], abs=0.1
+    )
+
+
+def test_standard_deviation_over_seeds_is_marked():
     assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.70 ± 0.04 (seeds)"
     assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1.0 ± 0.04 (seeds)"
     boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
     assert show(boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
-    few = {"mean": 85.0, "n": 2, "sd": 7.0, "values": [80.0, 90.0]}
-    assert (show(few), show_digits(few, 1)) == ("85.0 (80.0; 90.0)", "85.0 (80.0; 90.0)")
-    assert show_digits(boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
+    assert show_with_sd(boards) == "99.7 ± 1.0 ± 0.04 (seeds) [90.7, 108.7]"
+    assert show({"mean": 85.0, "n": 2, "sd": 7.0, "values": [80.0, 90.0]}) == "85.0 (80.0; 90.0)"
 
 
 @given(
@@ -222,179 +301,3 @@ def test_end_of_an_interval_is_not_rounded_to_zero():
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
 def test_stored_numbers_are_rounded_to_six_digits(value, kept):
     assert rounded({"a": [value, 3]}) == {"a": [kept, 3]}
-
-
-def test_only_marked_blocks_of_a_page_are_replaced():
-    pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
-    assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
-    assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
-    with pytest.raises(SchemaError, match="block b must be in exactly one page; it is in no page"):
-        fill(pages, {"b": "new"})
-    with pytest.raises(SchemaError, match="in exactly one page; it is in one.md, other.md"):
-        fill(pages | {"other.md": pages["one.md"]}, {"a": "new"})
-
-
-def test_each_metric_has_a_column():
-    assert {metric for row in TABLE_2.values() for metric in row} == set(PAPER_METRICS)
-
-
-def test_summary_has_our_scores_beside_the_papers_and_a_row_for_the_control():
-    numbers = all_experiments()
-    table = summary_table(numbers).set_index(HELD_OUT)
-    assert len(table) == len(numbers["table2"]) + 1
-    for name, model in models(numbers).items():
-        if name in numbers["table2"]:
-            title = model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")
-            for metric, column in (("accuracy_pct", "accuracy, %"), ("mse_f_N2", "MSE_F, N²")):
-                assert table.loc[title, f"{column} (paper)"].endswith(f"({TABLE_2[name][metric][0]:.3g})")
-    assert "(" not in table.loc[CONTROL, "accuracy, % (paper)"]
-    assert "R² of F" in table
-
-
-def test_summary_of_unseen_boards_has_the_fewest_and_the_most_labels():
-    rows = new_board()
-    table = summary_table(all_experiments("recorded") | {"new_board": rows}).set_index(HELD_OUT)
-    assert table.index.tolist() == [TITLES["shipped"], TITLES["rig"]]
-    for row in rows:
-        if row["method"] in IN_CONTEXT and row["labels_n"] in (0, 40):
-            shown = table.loc[TITLES[row["method"]], f"within 1 mm, %, {row['labels_n']} labels"]
-            assert shown == show(row["accuracy_pct"])
-    assert not any("10 labels" in column for column in table)
-
-
-def test_scene_without_held_out_boards_has_no_summary():
-    assert (
-        summary_table(
-            {name: experiment_numbers for name, experiment_numbers in all_experiments().items() if name != "table2"}
-        )
-        is None
-    )
-
-
-TABLE_1 = read_table1()
-PROPERTIES = (*TABLE_1.rows, LOCALISATION)
-
-
-def test_table_1_columns_have_sources_with_years():
-    assert list(TABLE_1.columns) == ["ReSkin", "DIGIT", "GelSlim", "BioTac", "RSkin"]
-    for name, year in zip(TABLE_1.columns, (2021, 2020, 2018, 2019, 2013), strict=True):
-        assert f"{year}" in TABLE_1.columns[name]
-
-
-def test_only_reskin_meets_every_requirement_in_table_1():
-    requirements = [name for name in TABLE_1.rows if name not in ("Type", "Frequency")]
-    met = {
-        column: all(TABLE_1.rows[name][i] == "yes" for name in requirements) for i, column in enumerate(TABLE_1.columns)
-    }
-    assert [column for column, all_met in met.items() if all_met] == ["ReSkin"]
-    assert {cell for name in requirements for cell in TABLE_1.rows[name]} == {"yes", "no", "?"}
-
-
-@given(st.dictionaries(st.sampled_from(PROPERTIES), st.text(max_size=9)))
-def test_table_1_contains_the_cells_of_the_paper(measured):
-    table = table1(TABLE_1, measured)
-    for (name, cells), (_, row) in zip(TABLE_1.rows.items(), table.iterrows(), strict=False):
-        assert [row["property"], *(row[column] for column in TABLE_1.columns)] == [name, *cells]
-        assert row[OURS] == measured.get(name, NOT_GIVEN)
-    if LOCALISATION in measured:
-        assert set(table.iloc[-1][list(TABLE_1.columns)]) == {NOT_GIVEN}
-        assert table.iloc[-1]["property"] == LOCALISATION
-    assert len(table) == len(TABLE_1.rows) + (LOCALISATION in measured)
-
-
-def test_table_1_calls_numbers_of_a_simulation_settings():
-    for source, rate, area in (
-        (
-            "simulated",
-            "400 Hz, a setting, computed from the times in the captures, simulated",
-            "mm, a setting, simulated",
-        ),
-        ("recorded", "400 Hz, recorded", "mm, recorded"),
-    ):
-        numbers = all_experiments(source)
-        numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(400.0)
-        numbers["sleeve"]["area_mm"] = [50.8, 101.6]
-        cells = measured(numbers)
-        assert cells["Frequency"] == rate
-        numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(9.2143)
-        assert measured(numbers)["Frequency"].startswith("9.21 Hz")
-        assert cells["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
-
-
-def test_list_below_table_1_contains_every_source():
-    meaning = table1(TABLE_1, {}).attrs["meaning"]
-    assert all(source in meaning for source in TABLE_1.columns.values())
-
-
-def test_unknown_property_in_table_1_is_refused():
-    with pytest.raises(ParamsError, match="Weight"):
-        table1(TABLE_1, {"Weight": "5 g"})
-
-
-@pytest.mark.parametrize(("rows", "fault"), [("{Type: [Magnetic]}", "2 cells, not 1"), ("{Type: [1, 2]}", "string")])
-def test_invalid_rows_of_table_1_are_refused(tmp_path, rows, fault):
-    file = tmp_path / "tables.yaml"
-    file.write_text(f"columns: {{a: x, b: y}}\nrows: {rows}\n")
-    with pytest.raises(ParamsError, match=fault):
-        read_table1(file)
-
-
-def described(source, **means):
-    return {
-        "source": source,
-        "over_skins": {name: {"mean": m, "least": m / 2, "most": 2 * m, "n": 3} for name, m in means.items()},
-    }
-
-
-SIMULATED = described("simulated", noise_xy_uT=3.3, force_max_N=40.0, step_z_uT=0.3227)
-RECORDED = described("recorded", noise_xy_uT=3.1, force_max_N=4.0)
-
-
-def test_table_of_skins_gives_mean_range_and_number_of_skins():
-    table = skins_table({"quick (simulated)": SIMULATED})
-    assert table["quick (simulated)"].tolist() == [
-        "3.3 [1.65 … 6.6] (3)",
-        "0.323 [0.161 … 0.645] (3)",
-        "40 [20 … 80] (3)",
-    ]
-    assert "simulated / nearest recorded" not in table
-
-
-def test_table_compares_simulated_skins_with_recorded_ones():
-    table = skins_table({"quick (simulated)": SIMULATED, "lab (recorded)": RECORDED})
-    ratios = dict(zip(table["quantity"], table["simulated / nearest recorded"], strict=True))
-    assert ratios["noise of one reading, x and y, µT"] == "1.1"
-    assert ratios["force, largest, N"] == "10"
-    assert ratios["resolution of a chip (one digital step), z, µT"] == "–"
-
-
-CASE = {
-    "area": "chip", "case": "steps", "what": "field per count", "reference": "data sheet", "error": 3.33e-05,
-    "message": "", "unit": "uT", "limit": 5e-5, "reason": "four decimals", "holds": True,
-}  # fmt: skip
-
-
-def test_table_of_extremes_has_errors_limits_and_failed_cases():
-    cases = [CASE, CASE | {"unit": "1", "error": 1.5e-3, "holds": False}]
-    cases.append(CASE | {"error": None, "message": "ValueError: no chip", "holds": False})
-    table = extremes_table({"cases": cases}, "simulated")
-    assert table["error"].tolist() == ["3.3e-05 uT", "0.0015", "ValueError: no chip"]
-    assert table["allowed"].tolist() == ["5e-05 uT", "5e-05", "5e-05 uT"]
-    assert table["holds"].tolist() == ["yes", "NO", "NO"]
-    assert table["source"].tolist() == ["simulated"] * 3
-
-
-def test_table_of_accuracy_has_run_times_only_if_they_were_measured():
-    row = {"study": "field", "method": "midpoint", "setting": "1 mm x 2", "error": 0.012, "unit": "1"}
-    failed = row | {"error": None}
-    assert accuracy_and_cost_table({"rows": [row, failed]}, "simulated")["error"].tolist() == ["0.012", "failed"]
-    timed = accuracy_and_cost_table({"rows": [row | {"seconds": 0.25}, failed]}, "simulated")
-    assert timed["run time, s"].tolist() == ["0.25", "–"]
-
-
-def test_table_of_a_run_lists_the_cost_of_each_stage():
-    tables = run_tables({"runtime": {"stages": {"train_multi": cost(seconds=0.25)}}}, "simulated")
-    assert list(tables) == ["stages"]
-    (line,) = tables["stages"].to_dict("records")
-    assert line["computed, s"] == "3.0"
-    assert line["last run, CPU s"] == "–"

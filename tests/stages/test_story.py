@@ -25,11 +25,10 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.catalogue import ANALYSES
-from pipeline.formatting import to_markdown
 from pipeline.report.claims import read_claims, resolve
 from pipeline.report.figures import headline
 from pipeline.report.numbers import join, timed_rows
-from pipeline.report.tables import table_2_summary
+from pipeline.report.tables import make_tables, table_texts
 from reskin import io
 from reskin.models.inputs import Scaler
 from tests.benchmarks import FULL
@@ -83,15 +82,13 @@ def test_report_contains_provenance_scores_and_byte_counts(story, numbers):
     capture = numbers["capture"]
     skipped = sum(n for key, n in capture.items() if key.startswith("skipped_") and key.endswith("_bytes_n"))
     assert capture["frame_bytes_n"] + skipped == capture["bytes_n"]
-    assert "simulated" in (story / "reports/ci/tables/table2.md").read_text()
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
 def test_stage_table2_writes_the_same_table_as_the_report(story, numbers):
     assert (story / "data/table2/ci/headline.svg").read_text() == headline(numbers, "simulated")
-    table = (story / "data/table2/ci/table2.md").read_text()
-    assert table == to_markdown(table_2_summary(numbers))
-    assert table in (story / OUTPUT).read_text()
+    table = (story / "data/table2/ci/table2.csv").read_text()
+    assert table == table_texts(make_tables(numbers))["table2.csv"]
 
 
 def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
@@ -164,7 +161,7 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert all("mean" in numbers[experiment][part]["accuracy_pct"] for part in parts)
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
-    named = {file.stem for file in tables.glob("*.md")}
+    named = {file.stem for file in tables.glob("*.csv")}
     assert named >= EXPERIMENTS_OF_CI - {"interference"} | {"table1", "claims", "single_sensor"}
     assert named >= {"interference_contacts", "interference_places"}
     page = (story / "reports/ci/index.html").read_text()
