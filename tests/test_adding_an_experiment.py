@@ -125,7 +125,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
     files = {
         "pipeline/experiments/repeat.py": MODULE,
-        CATALOGUE: insert_before(root / CATALOGUE, '    _analysis("sensitivity"', ENTRY),
+        CATALOGUE: insert_before(root / CATALOGUE, '    _analysis("sensitivity"', f"    {ENTRY.strip()},\n"),
         FLOW: insert_before(root / FLOW, "  report: #", f"{STAGE}\n"),
         scene: insert_before(root / scene, "- single_random", "- repeat\n"),
     }
@@ -138,16 +138,16 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     }  # fmt: skip
 
 
-def test_edit_of_a_caption_reruns_the_stages_that_show_it_and_edits_of_comments_rerun_no_stage(root, before):
+def test_edit_of_a_page_reruns_the_report_and_edits_of_comments_rerun_no_stage(root, before):
     # Both edits are made at once, because each call of `state` takes seconds.
-    captions, io = "pipeline/report/page.yaml", "reskin/io.py"
+    page, io = "pipeline/report/pages/paper.md", "reskin/io.py"
     edits = {
-        captions: (root / captions).read_text().replace("title: ", "title: More ", 1),
+        page: (root / page).read_text() + "More.\n",
         io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1),
     }
     with edited_files(root, edits):
         after = state(root)
-    assert stale_stages(before, after) == {"table2@ci", "report@ci"}  # Table2 depends on the captions of all tables.
+    assert stale_stages(before, after) == {"report@ci"}
 
 
 def test_edit_of_code_reruns_its_experiment_and_the_report(root, before):

@@ -15,8 +15,8 @@ from pipeline.catalogue import ANALYSES, MODULES, module_name
 from reskin import io
 from reskin.code import digest, imported
 
-# Packages and modules that only show results.
-SHOWING = ("pipeline.report", "pipeline.plot", "pipeline.formatting", "pipeline.paper")
+# Packages and modules that only show results, and the catalogue, whose effects on other stages are in the plan.
+SHOWING = ("pipeline.catalogue", "pipeline.report", "pipeline.plot", "pipeline.formatting", "pipeline.paper")
 # A stage that imports this module shows results. The module imports the modules of experiments by their names, so these
 # imports cannot be found in its code.
 PRESENTATION = "pipeline.report.experiments"
