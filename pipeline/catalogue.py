@@ -17,7 +17,7 @@ STAGES = {
     "train": ("train_single", "train_multi", "train_triplet", "adapt"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
     "rig": ("rig",),
-    "report": ("table2", "report"),
+    "report": ("report",),
 }
 MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
 EXPERIMENTS_PACKAGE = "pipeline.experiments"

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from pipeline import PLAN, SCENES
 from pipeline.catalogue import ANALYSES, EXPERIMENTS, Experiment, stages
 from pipeline.manage.registry import Registry, read_registry
-from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Scene, read_scene, scene_file
+from pipeline.scenes import MAIN_PROTOCOL, Scene, read_scene, scene_file
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
@@ -63,7 +63,6 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     for experiment in EXPERIMENTS.values():
         if experiment.file is not None or (experiment.protocol is not None and experiment.recorded):
             items[experiment.stage] = {name: _input(name, scenes[name], experiment) for name in items[experiment.stage]}
-    items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items["report"] = list(scenes)
     return {
         "scenes": {name: list(scene.experiments) for name, scene in scenes.items()},

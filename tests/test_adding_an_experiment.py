@@ -133,7 +133,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
     assert stale_stages(before, after) == {
-        "repeat@ci", "table2@ci", "report@ci",  # These stages read the numbers of all experiments.
+        "repeat@ci", "report@ci",  # These stages read the numbers of all experiments.
         "new_board@ci",  # This stage reads the list of experiments.
     }  # fmt: skip
 
@@ -154,7 +154,7 @@ def test_edit_of_code_reruns_its_experiment_and_the_report(root, before):
     module = "pipeline/experiments/shear.py"
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
-    assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci"}
+    assert stale_stages(before, after) == {"shear@ci", "report@ci"}
 
 
 def test_edited_comments_do_not_change_the_keys_of_cached_training_runs(tmp_path, monkeypatch):

@@ -66,7 +66,7 @@ def test_digest_of_a_stage_includes_the_modules_of_the_library_that_it_uses():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 
-@pytest.mark.parametrize("stage", sorted({*all_stages()} - {"table2", "report"}))
+@pytest.mark.parametrize("stage", sorted({*all_stages()} - {"report"}))
 def test_stages_that_compute_results_import_nothing_of_the_report(stage):
     assert not [name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")]
 

@@ -1,4 +1,4 @@
-"""Stages that present results: table2, and report (numbers, tables, figures and pages)."""
+"""Stage report: numbers, tables, figures and pages of a scene."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from pipeline import PLAN
-from pipeline.catalogue import stages
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded
 from pipeline.provenance import (
@@ -35,7 +34,7 @@ from pipeline.report.numbers import (
 )
 from pipeline.report.page import index_page, run_page, scene_page
 from pipeline.report.tables import make_tables, run_tables, table_texts
-from pipeline.scenes import TABLE_2, Scene, parse_scene
+from pipeline.scenes import Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -46,21 +45,6 @@ from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device as trained_on
-
-
-def table2(settings: Settings, scores: Path, tables: Path) -> None:
-    """Write our version of the paper's table 2 and its figure, as soon as the networks are trained.
-
-    The stage report writes both again, with the other results.
-    """
-    source, name = settings["source"], settings.scene
-    table = read_scores(scores / f"{stage}.parquet" for stage in stages(TABLE_2.values(), "models"))
-    numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
-    numbers = rounded(numbers)
-    table_2 = make_tables(numbers)["table2"]
-    io.write_texts(tables, table_texts({"table2": table_2}) | score_figures(numbers, source))
-    files = ", ".join(str(file) for file in sorted(tables.iterdir()))
-    say(f"{name} ({source})\n{table_2.to_string(index=False)}\n{name}: {files}")
 
 
 def report(

@@ -10,7 +10,7 @@ from tests.faults.harness import SCENE, Checkout, Result, Row, alive, fault, jud
 
 TRAINING_STAGES = ("train_single", "train_multi", "train_triplet", "adapt")
 STAGES = (
-    "code", "simulate", "ingest_simulated", "describe", "split", *TRAINING_STAGES, "table2",
+    "code", "simulate", "ingest_simulated", "describe", "split", *TRAINING_STAGES,
     "sensitivity", "audit", "report",
 )  # fmt: skip
 ATTEMPTS_N = 4

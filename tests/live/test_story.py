@@ -89,6 +89,7 @@ def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path):
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
         write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
+        shell.run("scenes", "use", "pressed")
     # tests/recordings/test_lab_story.py tests the report of a recorded scene.
     with warm_stages(root) as run_stages:
         run_stages("code", "ingest@pressed-run1", "split@pressed", "train_single@pressed")

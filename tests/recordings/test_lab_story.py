@@ -39,6 +39,7 @@ def lab(tmp_path_factory, shared_data, empty_store) -> Iterator[Path]:
         labels = CaptureNames(f"board{board}", f"skin{board}", None)
         prepared = preparing.foreign(shared_data / f"lab/board{board}_depth2.csv", "lab", labels, {})
         add.add(root, "lab", prepared, allow_copy=False)
+    plan.use(root, ["lab"])
     run(root, "dvc", "repro")
     return root
 

@@ -26,9 +26,7 @@ from ruamel.yaml import YAML
 
 from pipeline.catalogue import ANALYSES
 from pipeline.report.claims import read_claims, resolve
-from pipeline.report.figures import headline
 from pipeline.report.numbers import join, timed_rows
-from pipeline.report.tables import make_tables, table_texts
 from reskin import io
 from reskin.models.inputs import Scaler
 from tests.benchmarks import FULL
@@ -82,20 +80,14 @@ def test_report_contains_provenance_scores_and_byte_counts(story, numbers):
     capture = numbers["capture"]
     skipped = sum(n for key, n in capture.items() if key.startswith("skipped_") and key.endswith("_bytes_n"))
     assert capture["frame_bytes_n"] + skipped == capture["bytes_n"]
-    assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
-
-
-def test_stage_table2_writes_the_same_table_as_the_report(story, numbers):
-    assert (story / "data/table2/ci/headline.svg").read_text() == headline(numbers, "simulated")
-    table = (story / "data/table2/ci/table2.csv").read_text()
-    assert table == table_texts(make_tables(numbers))["table2.csv"]
+    assert "<svg" in (story / "data/reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
 def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
     shown = json.loads(run(story, "dvc", "metrics", "show", "--json").stdout)
     scores = shown[""]["data"]["reports/ci/scores.json"]["data"]
-    assert set(scores) == {"table2", "single_sensor", "drift_end", "shear", "interference"}
-    assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted", "control"}
+    assert set(scores) == {"table2", "single_sensor", "shear", "new_board"}
+    assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted"}
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
 
 
@@ -148,7 +140,7 @@ def test_experiments_on_many_skins_have_scores_for_each_board(story, numbers):
     }
     assert rows_n == {2 * 130 * 5}  # two skins x 130 presses of the second pass x 5 readings
     for name in ("sweep_pokes", "sweep_sensors"):
-        assert "<svg" in (story / f"reports/ci/figures/{name}.svg").read_text()
+        assert "<svg" in (story / f"data/reports/ci/figures/{name}.svg").read_text()
 
 
 def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
@@ -165,14 +157,15 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
     assert named >= EXPERIMENTS_OF_CI - {"interference"} | {"table1", "claims", "single_sensor"}
     assert named >= {"interference_contacts", "interference_places"}
     page = (story / "reports/ci/index.html").read_text()
-    figures = sorted((story / "reports/ci/figures").glob("*.svg"))
+    figures = sorted((story / "data/reports/ci/figures").glob("*.svg"))
     without = {"audit", "extremes", "accuracy_and_cost", "drift", "variation", "manual"}  # a figure of the same name
     assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - without
-    for figure in figures:
-        assert f'src="figures/{figure.name}"' in page
+    assert all(f'<figure id="{figure.stem}">' in page for figure in figures)
+    assert "More figures" not in page
+    assert "More tables" not in page
 
 
-def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(story, tmp_path):
+def test_only_provenance_and_the_page_of_the_run_depend_on_commit_machine_and_times(story, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(
         story, again, symlinks=True, ignore=shutil.ignore_patterns(".dvc", "raw", "mlflow.db", "mlartifacts")
@@ -185,7 +178,7 @@ def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(st
         subprocess.run(["git", *arguments], cwd=again, check=True)
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
              "--models", "data/models/ci", "--scores", "data/scores/ci", "--results", "data/results/ci",
-             "--reports", "reports/ci"]  # fmt: skip
+             "--reports", "reports/ci", "--figures", "data/reports/ci/figures"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
     on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
     run(again, "python", "-c", on_one_core, "report", *arguments)
@@ -195,8 +188,7 @@ def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(st
     )
     assert after.keys() == before.keys()
     changed = {name for name in after if after[name] != before[name]}
-    assert {name for name in changed if not name.startswith("ci/runtime/")} == {"ci/provenance.json"}
-    assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/accuracy_and_cost.svg"} <= changed
+    assert changed == {"ci/provenance.json", "ci/run.html"}
 
 
 def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(story, numbers):
@@ -246,7 +238,7 @@ def test_methods_have_errors_in_the_numbers_and_times_in_the_provenance(story, n
     assert {"training", "adaptation", "neglected term"} <= {row["study"] for row in rows}
     assert all(case["holds"] for case in numbers["extremes"]["cases"])
     assert set(numbers["described"]) == {"grid"}
-    assert "<svg" in (story / "reports/ci/runtime/accuracy_and_cost.svg").read_text()
+    assert "<svg" in (story / "reports/ci/run.html").read_text()
 
 
 def test_each_capture_has_a_parquet_file_with_units(story):
@@ -343,7 +335,7 @@ def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     models = story / "data/models/killed"
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci",
              "--folds", "data/models/ci/folds.json", "--models", str(models),
-             "--scores", str(models.with_suffix(".parquet"))]  # fmt: skip
+             "--scores", str(models.with_suffix(".parquet")), "--plots", str(story / "data/plots/killed")]  # fmt: skip
     command = [sys.executable, "-m", "pipeline", "train_triplet", *arguments]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     trials = story / ".reskin/cells"
@@ -375,8 +367,7 @@ def test_report_has_nothing_of_a_removed_experiment(story, run_stages):
     settings["experiments"].remove("sleeve")  # its settings stay
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
-    output = run(story, "reskin", "scenes", "use", "ci").stdout
-    assert "ci.yaml: no experiment reads sleeve, simulate.protocols.sleeve" in output
+    run(story, "reskin", "scenes", "use", "ci")
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")
     assert list(story.glob("reports/ci/**/*sleeve*")) == []

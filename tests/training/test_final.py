@@ -35,7 +35,8 @@ def test_final_model_is_trained_on_all_boards(tmp_path, monkeypatch, forces_know
     models = tmp_path / "models"
     section = parsed.section(Training, "train_multi")
     folders = (models / "train_multi", models / "final")
-    train_multi(parsed, section, tmp_path, tmp_path / "folds.json", *folders, tmp_path / "scores.parquet")
+    outputs = (*folders, tmp_path / "scores.parquet", tmp_path / "plots")
+    train_multi(parsed, section, tmp_path, tmp_path / "folds.json", *outputs)
 
     model = reskin.load_model(models / "final" / FILE).zero(np.full(15, 100.0))
     assert model.card["train_boards"] == ["b0", "b1"]
