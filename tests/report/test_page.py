@@ -70,6 +70,19 @@ def test_page_shows_the_numbers_of_the_scene():
     assert "72 [61, 79] %" in html
 
 
+def test_page_of_boards_with_few_labels_and_without_forces_is_whole():
+    numbers = io.read_json(ROOT / "reports/lab/numbers.json")
+    of_forces = {"rms_f_N", "mse_f_N2", "r2_f", "coverage_f_pct"}
+    numbers["new_board"] = [
+        {name: value for name, value in row.items() if name not in of_forces}
+        for row in numbers["new_board"]
+        if row.get("labels_n", 0) < 20
+    ]
+    html = scene_page(numbers, {}, figures_of("*.md"))
+    assert "with 10 labels" in html
+    assert "40 labels" not in html
+
+
 def test_tables_and_figures_that_no_section_names_are_shown_at_the_end():
     numbers = io.read_json(ROOT / "reports/quick/numbers.json")
     html = scene_page(numbers, {"mine": pd.DataFrame({"<a>": ["<b>"]})}, figures_of("*.md") | {"own.svg": SVG})
