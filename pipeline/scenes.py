@@ -17,8 +17,7 @@ from reskin.models.recipe import AdaptationRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
-# The rows of table 2, each with the experiment that provides its scores. If a scene runs all four experiments, stage
-# table2 writes this table as soon as they are done, before the report.
+# The rows of table 2, each with the experiment that provides its scores.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 # Experiments and sections that no longer exist, by the experiment that replaces them.
 REPLACED = {
