@@ -77,6 +77,7 @@ class Page:
     def html_of(self, template: str, title: str, **context: Any) -> str:
         """Fill a template and return the whole page as HTML, with its style and its figures inside."""
         body = MarkdownIt("commonmark", {"html": True}).enable("table").render(self.fill(template, **context))
+        body = body.replace("± ", "±\N{NO-BREAK SPACE}")
         body = re.sub(r"(?:<p>)?\x02(\d+)\x03(?:</p>)?", lambda match: self.parts[int(match[1])], body)
         style = (FOLDER / "style.css").read_text(encoding="utf-8")
         return (

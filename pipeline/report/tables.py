@@ -245,7 +245,7 @@ def new_board_contact(numbers: Numbers) -> pd.DataFrame:
 
 @of("compare")
 def compare(numbers: Numbers) -> pd.DataFrame:
-    """How each recorded board is oriented, and how well each simulation agrees with it."""
+    """How well each simulation agrees with each recorded board."""
     lines = []
     for board, row in numbers["compare"]["by_board"].items():
         simulated = {title: row if name == "fitted" else row.get(name, {}) for name, title in SIMULATIONS.items()}
@@ -255,8 +255,7 @@ def compare(numbers: Numbers) -> pd.DataFrame:
             shown = {"cosine": one.get("cosine_mean"), "explained": one.get("explained_median")}
             shown |= {"growth": growth.get("simulated"), "growth, recorded": growth.get("recorded")}
             line = {title: value if value is None else f"{value:.2f}" for title, value in shown.items()}
-            orientation = {"orientation": row["frames"]["sentence"]}
-            lines.append({"board": board, "simulation": simulation} | line | orientation)
+            lines.append({"board": board, "simulation": simulation} | line)
     return pd.DataFrame(lines)
 
 
