@@ -98,6 +98,8 @@ class Spreads(Strict):
     skin_modulus: Share  # relative sd of Young's modulus
     skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # sd of the skin's lateral offset along each axis
     skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # sd of the skin's rotation about z
+    skin_give_um: Annotated[float, Field(ge=0, le=100)]  # sd of `give_um` of the skin's `hold` along each axis
+    skin_away_um_mm: Annotated[float, Field(ge=0, le=50)]  # sd of `away_um_mm` of the skin's `hold`
     skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # sd of (true depth - commanded depth)
 
 

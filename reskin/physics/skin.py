@@ -35,13 +35,13 @@ class SkinDesign(Strict):
     # Whether the magnetisation is reversed. For a checkerboard skin, this is the same as a rotation by 90 degrees.
     flipped: bool
     base: layer.Base  # whether the skin is bonded to its base or slips on it
-    # How a finite skin slides on its base. If this is None, the skin is an infinite layer that does not slide, and its
-    # force is computed by `layer.force`.
+    # How a finite skin slides on its base. If this is None, the skin is an infinite layer that does not slide.
     hold: slide.HoldDesign | None
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
+    stiffening: Annotated[float, Field(ge=0, le=5)]  # exponent in `slide.stiffening_factor`; 0 is a linear elastic layer
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
 
     @model_validator(mode="after")
@@ -65,6 +65,7 @@ class Skin:
     sides_m: tuple[float, float]
     thickness_m: float
     modulus_Pa: float
+    stiffening: float
     tip_radius_m: float
     depth_zero_m: float  # true depth minus commanded depth
     base: layer.Base
@@ -104,6 +105,7 @@ def draw_skin(
     at_rest = rest.nodes_m, magnet.moments(j_T * strength[:, None], rest.volumes_m3)
     seated = slide.RigidMotion(seat_m[None], np.array([rotation_rad]))
     nodes_m, moments_A_m2 = slide.apply(seated, 0, at_rest)
+    hold = None if design.hold is None else _draw_hold(design.hold, spreads, rng)
     modulus_Pa = float(design.modulus_kPa * kilo * modulus)
     return Skin(
         name=name,
@@ -113,11 +115,20 @@ def draw_skin(
         sides_m=sides_m,
         thickness_m=thickness_m,
         modulus_Pa=modulus_Pa,
+        stiffening=design.stiffening,
         tip_radius_m=design.tip_radius_mm * milli,
         depth_zero_m=float(depth_zero_mm * milli),
         base=design.base,
-        hold=None if design.hold is None else design.hold.in_si(),
+        hold=hold,
     )
+
+
+def _draw_hold(nominal: slide.HoldDesign, spreads: Spreads, rng: np.random.Generator) -> slide.Hold:
+    give_x_um, give_y_um = nominal.give_um + spreads.skin_give_um * rng.standard_normal(2)
+    away_um_mm = nominal.away_um_mm + spreads.skin_away_um_mm * rng.standard_normal()
+    # The check of the settings is for nominal skins. On a single skin, the displacement may be away from the centre.
+    drawn = {"give_um": (float(give_x_um), float(give_y_um)), "away_um_mm": float(away_um_mm)}
+    return nominal.model_copy(update=drawn).in_si()
 
 
 def changes_of_field(
@@ -179,18 +190,15 @@ def moved_dipoles(
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
     """Return the rigid motion of the skin on its base due to each press, which is given by x, y and the true depth.
 
-    The motion is first computed as if the tip did not slip on the skin. This motion depends on the depth, but not on
-    Young's modulus. It is then limited to the motion that the friction between tip and skin can cause. This limit
-    depends on the force.
+    The motion is first computed as if the tip did not slip on the skin. It is then limited to the motion that the
+    friction between tip and skin can cause. Both depend on the force of the press.
     """
     places_m = true_m[:, :2] - skin.seat_m
-    relative_m2 = slide.force_at(
-        true_m[:, 2], modulus_Pa=1.0, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m
-    )
-    load = np.minimum(relative_m2 / hold.lets_go_m2, 1.0)
+    force_N = _forces_at(skin, true_m[:, 2])
+    load = np.minimum(force_N / hold.lets_go_N, 1.0)
     displacement_m = slide.press_displacement_m(places_m, load, give_m=hold.give_m, away=hold.away)
     whole = slide.rigid_motion(places_m, displacement_m, skin.sides_m)
-    return slide.limit_by_friction(whole, skin.modulus_Pa * relative_m2, hold.grip_N_per_m)
+    return slide.limit_by_friction(whole, force_N, hold.grip_N_per_m)
 
 
 def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
@@ -202,23 +210,31 @@ def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the normal force in N between tip and skin at each commanded depth; a force is never negative."""
-    layer_of_skin = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
-    true_m = depth_m + skin.depth_zero_m
-    if skin.hold is not None:
-        return slide.force_at(true_m, **layer_of_skin)
-    return layer.force(true_m, **layer_of_skin, base=skin.base)
+    """Return the normal force in N between tip and skin at each commanded depth; a force is never negative.
+
+    The force is that of a layer that is bonded to its base, or slips on it if the skin has `base: slipping` but no
+    `hold`, times `slide.stiffening_factor`. A skin with `hold` slides as a whole, but the friction under the tip holds
+    the material at the base.
+    """
+    return _forces_at(skin, depth_m + skin.depth_zero_m)
+
+
+def _forces_at(skin: Skin, true_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    base = skin.base if skin.hold is None else "bonded"
+    elastic_N = layer.force(
+        true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, modulus_Pa=skin.modulus_Pa, base=base
+    )
+    return elastic_N * slide.stiffening_factor(true_m, skin.thickness_m, skin.stiffening)
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return the shear modulus in Pa of the layer under the tip at each commanded depth.
 
-    The shear modulus of an incompressible material is E / 3, where E is Young's modulus. If the skin can slide on its
-    base, the result also includes the stiffening of the layer (see `slide.stiffening`).
+    The shear modulus of an incompressible material is E / 3, where E is Young's modulus. The result includes the
+    stiffening of the layer (see `slide.stiffening_factor`).
     """
-    if skin.hold is None:
-        return np.full(len(depth_m), skin.modulus_Pa / 3)
-    return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
+    factor = slide.stiffening_factor(depth_m + skin.depth_zero_m, skin.thickness_m, skin.stiffening)
+    return skin.modulus_Pa / 3 * factor
 
 
 def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:

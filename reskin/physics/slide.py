@@ -6,11 +6,11 @@ directions. With this model, the rigid motion of the skin follows from the displ
 (for a press), or from the tangential force (for a drag). The friction between tip and skin limits the motion. Without
 normal force, there is therefore no motion (see `limit_by_friction`).
 
-The normal force is the force of the slipping elastic layer of module `layer`, multiplied by (1 - d/h)^(-3/2), where d
-is the depth and h is the thickness. The factor accounts for the stiffening of the layer as it becomes thinner. For a
-skin with a thickness of 2 mm, it is 1.2 at a depth of 0.2 mm and 4.0 at 1.2 mm. Both this factor and the displacement
-due to a press are empirical: they were fitted to two recorded boards (scene lab), because the elastic layer alone does
-not describe the recordings.
+The normal force is the force of an elastic layer that is bonded to its base (module `layer`), multiplied by the factor
+(1 - d/h)^-n, where d is the depth, h is the thickness and n is the `stiffening`. Although the skin slides, the friction
+under a press holds the material at the base. With n = 0, the layer is linear elastic. With n above 0, it becomes
+stiffer as it becomes thinner. The displacement due to a press is empirical: it was fitted to recorded boards, because
+the elastic layer alone does not describe the recordings.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,6 @@ from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.magnet import Dipoles
 
-# Exponent of the stiffening, from the two recorded boards. Values from 1.25 to 2 fit their recordings equally well.
-STIFFENING = 1.5
 DEEPEST = 0.72  # greatest depth that `depth_at` returns, as a fraction of the thickness
 CENTRE_M = np.zeros(2)
 # Number of points on the curve from which `depth_at` interpolates the depth. Between the points, the depth is linear in
@@ -48,9 +46,9 @@ class HoldDesign(Strict):
     give_um: tuple[float, float]
     # displacement towards the skin's centre due to a light press, divided by the distance from the centre
     away_um_mm: Annotated[float, Field(ge=0, le=100)]
-    # Force divided by Young's modulus at which the displacement towards the centre vanishes. At smaller forces, this
-    # displacement decreases linearly with the force.
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]
+    # Force at which the displacement towards the centre vanishes. At smaller forces, this displacement decreases linearly
+    # with the force.
+    lets_go_N: Annotated[float, Field(gt=0, le=1e6)]
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base, due to screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # friction coefficient between tip and skin
 
@@ -59,7 +57,7 @@ class HoldDesign(Strict):
         return Hold(
             give_m=(self.give_um[0] * micro, self.give_um[1] * micro),
             away=self.away_um_mm * micro / milli,
-            lets_go_m2=self.lets_go_mm2 * milli**2,
+            lets_go_N=self.lets_go_N,
             springs_N_per_m=self.springs_N_mm * kilo,
             friction=self.friction,
         )
@@ -71,7 +69,7 @@ class Hold:
 
     give_m: tuple[float, float]
     away: float
-    lets_go_m2: float
+    lets_go_N: float
     springs_N_per_m: float
     friction: float
 
@@ -207,34 +205,33 @@ def _turn(rows, turn, move):
 
 
 def force_at(
-    depth_m: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
+    depth_m: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float, stiffening: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the normal force in N at each depth: the force of the slipping elastic layer times `stiffening`."""
+    """Return the normal force in N at each depth: the force of the bonded elastic layer times `stiffening_factor`."""
     elastic_N = layer.force(
-        depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base="slipping"
+        depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base="bonded"
     )
-    return elastic_N * stiffening(depth_m, thickness_m)
+    return elastic_N * stiffening_factor(depth_m, thickness_m, stiffening)
 
 
-def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Return the factor (1 - d/h)^(-3/2) by which a layer of the thickness h becomes stiffer at the depth d.
+def stiffening_factor(
+    depth_m: Float[np.ndarray, " n"], thickness_m: float, stiffening: float
+) -> Float[np.ndarray, " n"]:
+    """Return the factor (1 - d/h)^-n by which a layer of the thickness h is stiffer at the depth d; n is `stiffening`.
 
     The same factor is used for the normal force and for the shear modulus.
     """
-    return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
+    return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -stiffening
 
 
-def count_clipped(
-    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
-) -> int:
+def count_clipped(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, **shape: float) -> int:
     """Count the forces for which `depth_at` clips the depth, because they need a depth above its greatest depth."""
-    deepest_m = np.array([_deepest_m(thickness_m, tip_radius_m)])
-    deepest_N = force_at(deepest_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
-    return int((force_N > deepest_N).sum())
+    _, curve_m2 = _curve(**shape)
+    return int((np.cbrt((np.maximum(force_N, 0.0) / modulus_Pa) ** 2) > curve_m2[-1]).sum())
 
 
 def depth_at(
-    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
+    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float, stiffening: float
 ) -> Float[np.ndarray, " n"]:
     """Return the depth in m at which the normal force has the given value, for each force.
 
@@ -243,25 +240,20 @@ def depth_at(
     """
     if not modulus_Pa > 0:
         raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Correct modulus_kPa of the skin.")
-    curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
+    curve_m, curve_m2 = _curve(thickness_m=thickness_m, tip_radius_m=tip_radius_m, stiffening=stiffening)
     relative_m2 = np.maximum(force_N, 0.0) / modulus_Pa  # a negative force is treated as 0
     return np.interp(np.cbrt(relative_m2**2), curve_m2, curve_m)
 
 
-def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
-    """Return the greatest depth of `depth_at`.
-
-    It is the smaller one of `DEEPEST` thicknesses and a value slightly below the tip radius.
-    """
-    return min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
-
-
 @lru_cache(maxsize=64)
-def _curve(thickness_m: float, tip_radius_m: float) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+def _curve(
+    *, thickness_m: float, tip_radius_m: float, stiffening: float
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     # Return equally spaced depths in m, and (F / E)^(2/3) at each depth, where F is the force and E is Young's modulus.
-    curve_m = np.linspace(0, _deepest_m(thickness_m, tip_radius_m), CURVE_N)
-    known_m2 = force_at(curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
-    return curve_m, np.cbrt(known_m2**2)
+    deepest_m = min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
+    curve_m = np.linspace(0, deepest_m, CURVE_N)
+    shape = {"thickness_m": thickness_m, "tip_radius_m": tip_radius_m, "stiffening": stiffening}
+    return curve_m, np.cbrt(force_at(curve_m, modulus_Pa=1.0, **shape) ** 2)
 
 
 def _rho2_m2(sides_m: tuple[float, float]) -> float:

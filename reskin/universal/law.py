@@ -95,6 +95,9 @@ class Law:
     # The displacement `away_um_mm` decreases with the force of the press, and vanishes at this force. The value was
     # chosen on both boards of scene lab.
     lets_go_N: float = 8.0
+    # Exponent by which the force grows as the layer becomes thinner (`slide.stiffening_factor`). Fits to both boards of
+    # scene lab, with forces up to 9.5 N, gave about 1 (tools/fit_skin.py).
+    stiffening: float = 1.0
     # Lateral stiffness (7 N/mm) divided by the friction coefficient (0.8), both from nominal.yaml, key skin.hold. It
     # limits the slide under a light press, because friction can then cause only a part of the displacement.
     grip_N_mm: float = 8.75
@@ -232,7 +235,7 @@ def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) ->
 def _layer(law: Law, setup: Setup) -> dict[str, float]:
     return {
         "modulus_Pa": law.modulus_MPa * mega, "thickness_m": setup.thickness_m,
-        "tip_radius_m": setup.tip_radius_mm * milli,
+        "tip_radius_m": setup.tip_radius_mm * milli, "stiffening": law.stiffening,
     }  # fmt: skip
 
 

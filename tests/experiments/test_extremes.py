@@ -103,7 +103,7 @@ FAULTS = {
     "rings_slipping_1": (layer, "_kernel", lambda original: lambda *args: 1.1 * original(*args)),
     "far_field": (deformation, "displacement", stretched),
     "depth_0.72": (deformation, "move_dipoles", without_rotation),
-    "thickness_20mm": (slide, "stiffening", lambda _: lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3),
+    "thickness_20mm": (slide, "stiffening_factor", lambda _: lambda depth_m, *others: 1 + np.maximum(depth_m, 0) / 1e-3),
     "lifted_drag": (contact, "_in_series", lambda _: lambda layers, base: layers[:, None, None] * np.eye(2)),
     "stiff_relaxation": (aging, "_mean_decay", naive_quotient),
     "steps": (chip, "STEP_AT_GAIN_ONE_uT", lambda _: (0.161, 0.161, 0.294)),

@@ -320,7 +320,7 @@ def test_pokes_deeper_than_the_verified_depth_are_counted():
     assert [count_beyond_verified(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
 
 
-HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
+HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_N": 8.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
 def held_skin(spread=UNEVEN, **changes):

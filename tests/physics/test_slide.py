@@ -17,7 +17,7 @@ SQUARE = (SIDE_M, SIDE_M)
 places_m = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
 displacements_m = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
 NO_SLIDE = {"give_m": (0.0, 0.0), "away": 0.0}
-HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
+HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_N": 8.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
 def motion_of(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
@@ -157,7 +157,7 @@ def test_dipoles_rotate_about_the_middle_of_the_skin():
     np.testing.assert_allclose(about_m, slide.apply(motion, 1, (nodes_m - shift_m, moments))[0] + shift_m, atol=1e-17)
 
 
-TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
+TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3, "stiffening": 1.5}
 
 
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
@@ -177,7 +177,7 @@ def test_force_has_the_limits_of_small_and_great_depth():
     )
     at_m = np.array([0.75 * H_M])
     assert slide.force_at(at_m, **layer_settings)[0] == pytest.approx(
-        8 * layer.force(at_m, **layer_settings, base="slipping")[0]
+        8 * slide.force_at(at_m, **(layer_settings | {"stiffening": 0.0}))[0]
     )
     assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(slide.DEEPEST * H_M)
     assert slide.count_clipped(np.array([1.0, 1e6]), **layer_settings) == 1
@@ -190,8 +190,18 @@ def test_force_has_the_limits_of_small_and_great_depth():
         slide.depth_at(np.array([1.0]), **(layer_settings | {"modulus_Pa": 0.0}))
 
 
+def test_force_without_stiffening_is_that_of_the_bonded_layer():
+    at_m, of_layer = np.linspace(0.0, 1.2e-3, 7), {"thickness_m": H_M, "tip_radius_m": 3e-3, "modulus_Pa": 1.9e5}
+    bonded_N = layer.force(at_m, **of_layer, base="bonded")
+    np.testing.assert_array_equal(slide.force_at(at_m, **of_layer, stiffening=0.0), bonded_N)
+    # Dimitriadis et al. (2002), bonded layer, which is within 10 % of the exact sphere at these depths.
+    chi = np.sqrt(3e-3 * at_m) / H_M
+    series = 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
+    np.testing.assert_allclose(bonded_N, 16 / 9 * 1.9e5 * np.sqrt(3e-3) * at_m**1.5 * series, rtol=0.1)
+
+
 def test_depth_of_a_sharp_tip_is_limited_by_its_radius():
-    layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
+    layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5, "stiffening": 0.0}
     assert slide.depth_at(np.array([0.1]), **layer_settings)[0] < 0.5e-3
     assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(0.999 * 0.5e-3)
     assert slide.count_clipped(np.array([1e-3, 1e6]), **layer_settings) == 1

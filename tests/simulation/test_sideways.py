@@ -130,7 +130,7 @@ def test_raising_the_skin_equals_dragging_deeper():
 
 
 HELD = EVEN.skin.model_copy(
-    update={"hold": HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_mm2=40.0, springs_N_mm=7.0, friction=0.8)}
+    update={"hold": HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_N=8.0, springs_N_mm=7.0, friction=0.8)}
 )
 
 

@@ -359,7 +359,7 @@ def scaled(board: Board, skin: Skin, thickness_m: float) -> float:
     """Return the error of dB, which is unchanged, and of the force / length^2, if all lengths are scaled."""
     scale, hold = thickness_m / skin.thickness_m, skin.hold
     if hold is not None:
-        changes = {"lets_go_m2": scale**2 * hold.lets_go_m2, "springs_N_per_m": scale * hold.springs_N_per_m}
+        changes = {"lets_go_N": scale**2 * hold.lets_go_N, "springs_N_per_m": scale * hold.springs_N_per_m}
         hold = replace(hold, give_m=(scale * hold.give_m[0], scale * hold.give_m[1]), **changes)
     other = replace(
         skin, nodes_m=scale * skin.nodes_m, moments_A_m2=scale**3 * skin.moments_A_m2, seat_m=scale * skin.seat_m,
