@@ -1,13 +1,14 @@
 """Fit the settings of the simulated skin to recorded boards with known places and forces (not in the paper).
 
-The nominal skin (reskin/simulation/nominal.yaml) takes its slide, amplitude, modulus and stiffening from these fits. Run in
-a checkout with the recordings of scene lab (`reskin fetch lab`, then `dvc repro ingest@lab`):
+The slide and the magnetisation of the nominal skin are from these fits. Run in a checkout with the recordings of scene
+lab (`reskin fetch lab`, `reskin scenes use lab`, `dvc repro describe@lab`):
 
     python -m tools.fit_skin lab > docs/measured/skin.md
 
 Each board is fitted three times, always with the gap of its layout:
 
-- linear: without stiffening, presses up to 4.5 N. The paper scales forces by 3 N, so its skins were pressed about as hard.
+- linear: without stiffening, presses up to 4.5 N. The released network scales forces by 3 N, so the paper's skins were
+  pressed about as hard.
 - stiffening: presses up to 4.5 N, and the exponent of the stiffening is fitted, too.
 - hard: all presses, and the exponent of the stiffening is fitted, too.
 
@@ -29,7 +30,6 @@ from pipeline.experiments.compare import agreement
 from pipeline.experiments.results import read_captures
 from pipeline.settings import read_settings
 from pipeline.training.recorded import Compare
-from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.universal.law import AlignedPresses, Setup, beyond_n, fit, simulate_uT
 from reskin.universal.presses import pool_skins
@@ -40,20 +40,33 @@ LINEAR = (
     "seat_x_mm", "seat_y_mm", "rotation_deg", "label_x_mm", "label_y_mm", "amplitude", "modulus_MPa", "away_um_mm",
     "give_x_um", "give_y_um", "lets_go_N",
 )  # fmt: skip
+ABOUT = """\
+- fits: `linear` without stiffening, `stiffening` with a fitted exponent, both up to 4.5 N; `hard`: the same, all forces
+- sd_...: standard deviation over fits to places that are drawn with replacement
+- cosine: mean cosine between recorded and simulated field changes; growth: exponent n in |dB| ~ F^n
+- beyond_n: number of presses whose force is too large for the law
+"""
 SHOWN = ("modulus_MPa", "stiffening", "amplitude", "away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
-FITS = {"linear": (LINEAR, FORCE_MAX_N), "stiffening": ((*LINEAR, "stiffening"), FORCE_MAX_N),
-        "hard": ((*LINEAR, "stiffening"), np.inf)}  # fmt: skip
-# Parameters at which a fit starts, and means of their priors. A stiffer layer needs a softer material.
-STARTS = {"linear": {"modulus_MPa": 0.4, "stiffening": 0.0, "lets_go_N": 6.0},
-          "stiffening": {"modulus_MPa": 0.2, "stiffening": 1.0, "lets_go_N": 6.0},
-          "hard": {"modulus_MPa": 0.2, "stiffening": 1.0, "lets_go_N": 6.0}}  # fmt: skip
+ALL = (*LINEAR, "stiffening")
+FITS = {"linear": (LINEAR, FORCE_MAX_N), "stiffening": (ALL, FORCE_MAX_N), "hard": (ALL, np.inf)}
+# Parameters at which a fit starts, and means of their priors. A layer that stiffens needs a softer material.
+STIFFENING_START = {"modulus_MPa": 0.2, "stiffening": 1.0, "lets_go_N": 6.0}
+STARTS = {
+    "linear": {"modulus_MPa": 0.4, "stiffening": 0.0, "lets_go_N": 6.0},
+    "stiffening": STIFFENING_START,
+    "hard": STIFFENING_START,
+}
 
 
 def select(presses: AlignedPresses, kept: np.ndarray) -> AlignedPresses:
     """Return some of the presses on a board; `kept` is a mask, or indices that may repeat."""
     recorded = presses.recorded
-    names = ("group_i", "place_mm", "force_N", "db_uT", "noload_uT")
-    thinned = replace(recorded, **{name: getattr(recorded, name)[kept] for name in names})
+    names = ("place_mm", "force_N", "db_uT", "noload_uT")
+    groups, group_i = np.unique(recorded.group_i[kept], return_inverse=True)
+    thinned = replace(
+        recorded, groups=tuple(recorded.groups[i] for i in groups), group_i=group_i.ravel(),
+        **{name: getattr(recorded, name)[kept] for name in names},
+    )  # fmt: skip
     return replace(presses, recorded=thinned, place_mm=presses.place_mm[kept], db_uT=presses.db_uT[kept])
 
 
@@ -67,7 +80,7 @@ def resamples(presses: AlignedPresses, draws_n: int, seed: int) -> Iterator[Alig
 
 
 def fit_board(presses: AlignedPresses, setup: Setup, draws_n: int) -> Iterator[dict[str, object]]:
-    """Yield one row per fit of `FITS`: fitted values, their uncertainties (`sd_...`) and the agreement with the board."""
+    """Yield one row per fit of `FITS`: fitted values, their uncertainties (`sd_...`), agreement with the board."""
     for name, (names, force_max_N) in FITS.items():
         chosen = select(presses, presses.recorded.force_N <= force_max_N)
         started = replace(setup, start_law=replace(setup.start, **STARTS[name]))
@@ -101,14 +114,15 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = read_settings(arguments.scene, Path())
     indentations = Path("data/indentations") / arguments.scene
-    axes = settings.section(Compare, "compare").axes(settings.shared_section(SkinDesign, "skin"))
+    axes = settings.section(Compare, "compare").axes
     boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))), with_force=False)
     known = {board: presses for board, presses in boards.items() if presses.forces_known}
-    rows = [row for presses in known.values() for row in fit_board(axes.align(presses), axes.setup, arguments.draws_n)]
     if len(known) < 2:
         sys.exit(f"scene {arguments.scene} has {len(known)} boards with known forces; a spread needs at least two")
+    rows = [row for presses in known.values() for row in fit_board(axes.align(presses), axes.setup, arguments.draws_n)]
     fits = pd.DataFrame(rows)
     print(f"Fits to the recorded boards of scene {arguments.scene} (`python -m tools.fit_skin {arguments.scene}`)\n")
+    print(ABOUT)
     print(fits.to_markdown(index=False, floatfmt=".3g"))
     print("\nOver boards, linear fits\n")
     print(over_boards(fits).to_markdown(floatfmt=".3g"))
