@@ -91,7 +91,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         steps_n: int = 3000,
         batch_n: int = 128,
         rate_max: float = 1.2e-2,
-        gradient_norm_max: float = 0.3,
+        gradient_norm_max: float = 1.0,
         weight_decay: float = 0.0,
         random_state: int = 0,
     ) -> None:
