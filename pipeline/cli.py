@@ -311,7 +311,7 @@ def make_model(
     layout: Annotated[
         Path,
         Option(
-            help="Layout of your board: a YAML file like reskin/universal/layouts/reskin.yaml, or the YAML file of a "
+            help="Layout of your board: a YAML file like reskin/layouts/reskin.yaml, or the YAML file of a "
             "scene that contains a layout, or one of the names reskin, anyskin, eflesh."
         ),
     ],

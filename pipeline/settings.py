@@ -16,7 +16,7 @@ from pipeline import PARAMS, PLAN, SCENES
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError, did_you_mean
 from reskin.models.recipe import HEADLINE, AdaptationWithBase, AugmentedRecipe, Name, Recipe
-from reskin.simulation.defaults import NOMINAL, SHARED
+from reskin.simulation.defaults import SHARED, nominal
 
 Section = TypeVar("Section", bound=Strict)
 Row = dict[str, Any]
@@ -170,8 +170,7 @@ def read_settings(scene: str, root: Path = Path()) -> Settings:
 
 def read_shared_files(root: Path = Path()) -> dict[str, Any]:
     """Read the settings that all scenes share: `params.yaml` and the nominal skin."""
-    nominal = read_yaml(NOMINAL)
-    return {**read_yaml(root / PARAMS), **{name: nominal[name] for name in SHARED}}
+    return {**read_yaml(root / PARAMS), **{name: nominal(name) for name in SHARED}}
 
 
 def take(section: dict[str, Any], key: str, where: str) -> Any:

@@ -22,6 +22,7 @@ from pipeline.training.shipping import read_layout_of
 from reskin import config
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, ReskinError
+from reskin.layouts import FOLDER
 from reskin.recordings import preparing, probe
 from reskin.recordings.header import Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
@@ -29,7 +30,7 @@ from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
-from reskin.universal.layout import FOLDER, paper_layout
+from reskin.universal.layout import paper_layout
 from tests.board.signals import make_frames
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import PRESSES, row, write

@@ -1,10 +1,10 @@
 """Show which properties of simulated skins determine the scores of the paper's table 2 (not in the paper).
 
 The networks of table 2 are trained and tested in several worlds. A world is a simulation that differs from the default
-simulation in one factor, such as the spread of stiffness. The worlds are in tools/worlds.yaml. All worlds have the same
-presses, noise, folds and random draws of skins. Run in the checkout:
+simulation in one respect, such as how differently skins slide. The worlds are in tools/worlds.yaml. All worlds have the
+same presses, noise, folds and random draws of skins. Run in the checkout:
 
-    python -m tools.worlds --steps-n 20 --worlds default residual-0.42
+    python -m tools.worlds --figure docs/img/worlds.svg
 """
 
 import argparse
@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+from pydantic import Field
 from scipy.constants import micro, milli
 
 from pipeline.executors import make_executor
 from pipeline.paper import TABLE_2
+from pipeline.plot import drawing, svg
 from pipeline.settings import Adaptations, Settings, Training, read_shared_files
 from pipeline.simulation import simulation_settings
 from pipeline.training.jobs import (
@@ -32,7 +34,7 @@ from pipeline.training.jobs import (
     preload_training,
     training_data,
 )
-from reskin.config import Strict, read_yaml
+from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Rows, stack
 from reskin.data.splits import Split, draw_folds
 from reskin.metrics import score
@@ -51,24 +53,23 @@ WAVES_N = 48  # the smooth random error is a sum of this number of random cosine
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 # For each row of table 2, the experiment whose networks the row scores.
 ROWS = {"transfer": "single", "lobo": "multi", "triplet": "triplet", "adapt": "adapted"}
+ROW_NAMES = {"single": "one skin", "multi": "many skins", "triplet": "triplet loss", "adapted": "adapted"}
 
 
 class Residual(Strict):
-    """Sizes and correlation lengths of a smooth random error that is added to the simulated changes of field."""
+    """A smooth random error that is added to the simulated changes of field."""
 
-    sizes: tuple[float, ...]  # rms sizes relative to |dB|, one world per size
     length_mm: float  # correlation length along x and y
     length_log_N: float  # correlation length along the logarithm of the force
     own_share: float  # fraction of the error's variance that is drawn for each skin; the rest is the same on all skins
 
 
-class Worlds(Strict):
-    """Values of each factor, one world per value; in each world, all other factors have their default values."""
+class Changes(Strict):
+    """What a world changes: settings of sections `skin` and `spreads`, and the rms size of the error / |dB|."""
 
-    residual: Residual
-    skin_modulus: tuple[float, ...]  # values of spreads.skin_modulus
-    amplitude_and_gap: tuple[float, ...]  # factors of spreads.skin_amplitude and spreads.board_gap
-    friction: tuple[float, ...]  # values of skin.hold.friction, the friction between skin and tip
+    skin: dict[str, float] = Field(default_factory=dict)
+    spreads: dict[str, float] = Field(default_factory=dict)
+    residual: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -80,27 +81,16 @@ class World:
     residual: float = 0.0
 
 
-def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
-    """Return all worlds; the first is the default world."""
-    spreads, hold = simulation.spreads, simulation.skin.hold
-    worlds = [World("default", simulation)]
-    worlds += [World(f"residual-{size:g}", simulation, size) for size in section.residual.sizes if size > 0]
-    changed: dict[str, dict[str, float]] = {}
-    for sd in section.skin_modulus:
-        if sd != spreads.skin_modulus:
-            changed[f"skin_modulus-{sd:g}"] = {"skin_modulus": sd}
-    for times in section.amplitude_and_gap:
-        if times != 1:
-            scaled = {name: times * getattr(spreads, name) for name in ("skin_amplitude", "board_gap")}
-            changed[f"amplitude_and_gap-{times:g}"] = scaled
-    for name, values in changed.items():
-        update = {"spreads": spreads.model_copy(update=values)}
-        worlds.append(World(name, simulation.model_copy(update=update)))
-    for friction in section.friction:
-        if hold is not None and friction != hold.friction:
-            skin = simulation.skin.model_copy(update={"hold": hold.model_copy(update={"friction": friction})})
-            worlds.append(World(f"friction-{friction:g}", simulation.model_copy(update={"skin": skin})))
-    return worlds
+def world_of(simulation: SimulationSettings, name: str, changes: Changes) -> World:
+    """Return a simulation with the changes of a world; unknown settings raise ParamsError."""
+    changed = {
+        key: parse(type(section), section.model_dump(mode="json") | update, f"{FILE.name}: {name}: {key}")
+        for key, section, update in (
+            ("skin", simulation.skin, changes.skin),
+            ("spreads", simulation.spreads, changes.spreads),
+        )
+    }
+    return World(name, simulation.model_copy(update=changed), changes.residual)
 
 
 def draw_smooth_error(
@@ -192,35 +182,54 @@ def scores_of(data: SceneData) -> Iterator[dict[str, Any]]:
             yield {"row": ROWS[job.experiment], **score(data.rows.target[job.test][own], result.predicted[own])}
 
 
+def draw(table: pd.DataFrame) -> str:
+    """Draw accuracy and MSE_F of each row of table 2 in each world, and of the paper; return the figure as SVG."""
+    labels = {"accuracy_pct": "readings within 1 mm / %", "mse_f_N2": "MSE of the force / N²"}
+    names = list(table["world"].unique())
+    with drawing(1.2 + 0.45 * len(names), "Rows of table 2 in simulated worlds and in the paper") as figure:
+        panels = figure.subplots(1, len(labels), sharey=True)
+        for axes, (metric, label) in zip(panels, labels.items(), strict=True):
+            for shift, (row, of_row) in enumerate(table.groupby("row", sort=False)):
+                y = [names.index(name) + 0.15 * (shift - 1.5) for name in of_row["world"]]
+                axes.plot(of_row[metric], y, "o", label=ROW_NAMES[str(row)])
+            axes.set(xlabel=label, yticks=range(len(names)), yticklabels=names)
+        panels[1].set(xscale="log")
+        panels[0].invert_yaxis()
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        return svg(figure)
+
+
 def main() -> None:
-    """Print the mean scores of table 2 in each world: over pairs of skins (row single), or over held-out skins."""
+    """Print and draw the mean scores of table 2 in each world: over pairs of skins, or over held-out skins."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", nargs="+", help="names of worlds, such as friction-0.35; default: all worlds")
+    parser.add_argument("--worlds", nargs="+", help="names of worlds; default: all worlds")
     parser.add_argument("--steps-n", type=int, help="number of training steps, for a quick trial")
+    parser.add_argument("--figure", type=Path, help="file for the figure, such as docs/img/worlds.svg")
     arguments = parser.parse_args()
     preload_training()
     content = read_yaml(FILE)
     if arguments.steps_n is not None:
         for name in ("train_single", "train_multi", "train_triplet", "adapt"):
             content[name]["steps_n"] = arguments.steps_n
+    known = {name: parse(Changes, changes, f"{FILE.name}: {name}") for name, changes in content.pop("worlds").items()}
+    residual = parse(Residual, content.pop("residual"), f"{FILE.name}: residual")
+    if unknown := set(arguments.worlds or ()) - set(known):
+        parser.error(f"unknown worlds {', '.join(sorted(unknown))}; known: {', '.join(known)}")
     settings = Settings("worlds", str(FILE), content, read_shared_files())
-    section = settings.section(Worlds, "worlds")
-    worlds = {world.name: world for world in worlds_of(simulation_settings(settings), section)}
-    if unknown := set(arguments.worlds or ()) - set(worlds):
-        parser.error(f"unknown worlds {', '.join(sorted(unknown))}; known: {', '.join(worlds)}")
-    scores = []
-    for name in arguments.worlds or worlds:
-        world = worlds[name]
-        by_skin = (
-            skin_rows(world, section.residual, settings.seed, *names) for names in list_captures(world.simulation, MAIN)
-        )
+    nominal, scores = simulation_settings(settings), []
+    for name in arguments.worlds or known:
+        world = world_of(nominal, name, known[name])
+        by_skin = (skin_rows(world, residual, settings.seed, *names) for names in list_captures(world.simulation, MAIN))
         rows = reduce(stack, by_skin)
         folds = draw_folds(rows, ("transfer", "lobo"), settings.section(Split, "split"), settings.seed)
         data = SceneData("worlds", settings, rows, folds)
         scores += [{"world": name} | row for row in scores_of(data)]
-    table = pd.DataFrame(scores).groupby(["world", "row"], sort=False)[list(METRICS)].mean().reset_index()
+    means = pd.DataFrame(scores).groupby(["world", "row"], sort=False)[list(METRICS)].mean().reset_index()
     paper = [{"world": "paper", "row": row, **{name: TABLE_2[row][name][0] for name in METRICS}} for row in TABLE_2]
-    print(pd.concat([table, pd.DataFrame(paper)]).to_string(index=False, float_format="{:.3g}".format))
+    table = pd.concat([means, pd.DataFrame(paper)], ignore_index=True)
+    print(table.to_string(index=False, float_format="{:.3g}".format))
+    if arguments.figure is not None:
+        arguments.figure.write_text(draw(table), encoding="utf-8")
 
 
 if __name__ == "__main__":  # worker processes import this module

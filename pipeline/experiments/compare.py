@@ -20,7 +20,6 @@ from pipeline.experiments.results import read_captures, write_results
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
-from reskin.physics.skin import SkinDesign
 from reskin.universal.axes import BoardAxes
 from reskin.universal.frames import describe_outside, frames_of
 from reskin.universal.law import SEVEN, TEN, AlignedPresses, Law, beyond_n, fit, nominal_uT, simulate_uT
@@ -35,10 +34,9 @@ def compare(settings: Settings, section: Compare, indentations: Path, results: P
     For boards without known forces, only the orientations of labels, chips and skin are checked.
     """
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
-    axes = section.axes(settings.shared_section(SkinDesign, "skin"))
+    axes = section.axes
     numbers, drawn = compare_boards(pool_skins(captures, with_force=False), axes)
-    outline = {} if section.layout is None else {"outline": _outline(axes)}
-    write_results(results, numbers, drawn | outline)
+    write_results(results, numbers, drawn | {"outline": _outline(axes)})
 
 
 def compare_boards(boards: Mapping[str, RecordedPresses], axes: BoardAxes) -> tuple[dict[str, Any], dict[str, Any]]:

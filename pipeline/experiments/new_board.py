@@ -207,7 +207,7 @@ Methods = Mapping[str, Sequence[Method]]  # by name; the paper's networks are th
 
 def methods_of(board: Board, section: NewBoard, compare: Compare, models: Path, *, rig: bool) -> Methods:
     """Return the methods for a held-out board. None but `shipped` is made without recordings of the other boards."""
-    turned = compare.labels_mirrored, compare.labels_middle_mm
+    turned = compare.labels_mirrored, compare.layout.centre_mm
     methods: dict[str, Sequence[Method]] = {}
     if section.model is not None:
         methods[SHIPPED] = [InContext(Path(section.model), *turned)]
@@ -344,7 +344,7 @@ def new_board(
     """Score every method on every held-out board."""
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
-    boards = read_boards(data, captures, compare.labels_middle_mm)
+    boards = read_boards(data, captures, compare.layout.centre_mm)
     drawn = {
         board.skin: [
             draw_presses(board, split, max(section.presses_n), settings.seed, draw_i)

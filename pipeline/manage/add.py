@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,7 +36,6 @@ from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.orientation import other_orientation, presses_of
 from reskin.recordings.preparing import CaptureNames, Prepared
-from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
@@ -83,7 +81,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         write_registry(root, after)
         _update_plan(root, scene, after)
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, read_settings(scene, root), nominal("skin"), shared.faults)
+        _warn_of_departures(target, read_settings(scene, root), shared.faults)
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
     if all(other.skin != complete.skin for other in before.captures.get(scene, {}).values()):
@@ -219,18 +217,16 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
         )
 
 
-def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
+def _warn_of_departures(folder: Path, settings: Settings, policy: FaultPolicy) -> None:
     """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
     # imported here, because importing the physics takes seconds
     from pipeline.training.recorded import Compare
-    from reskin.physics.skin import SkinDesign
     from reskin.universal.frames import find_departure
 
     _, blocks, _ = open_capture(folder, policy)
     section = settings.section(Compare, "compare")
     try:
-        axes = section.axes(config.parse(SkinDesign, skin, "nominal.yaml: skin"))
-        sentence = find_departure(list(blocks), axes)
+        sentence = find_departure(list(blocks), section.axes)
     except ReskinError as error:
         sentence = f"The orientation of labels, chips and skin was not compared with the scene's settings: {error}"
     if sentence:

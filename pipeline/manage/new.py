@@ -8,8 +8,9 @@ from pipeline import SCENES
 from pipeline.scenes import Source, read_scene, scene_names
 from reskin import io
 from reskin.errors import ParamsError
+from reskin.layouts import FOLDER
 from reskin.recordings.header import NAME, NAME_RULE
-from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
+from reskin.universal.layout import BoardLayout, paper_layout, read_layout
 from reskin.universal.model import FILE
 
 PRESSES_MAX_N = 65  # largest number of unlabelled presses of a held-out skin, as in scene lab

@@ -24,7 +24,7 @@ def rig(settings: Settings, section: TrainingSettings, indentations: Path, model
     if not set(boards.presses) <= set(boards.rows.board):  # their names are `board/skin` if a board has several skins
         what = f"experiment rig needs boards with one skin each, but the scene has {', '.join(boards.presses)}"
         raise ParamsError(f"scene {settings.scene}: {what}. Remove this experiment from the scene.")
-    layout = settings.section(Compare, "compare").board_layout(settings.scene)
+    layout = settings.section(Compare, "compare").layout
     powers = load_universal().powers
     made = make_models(boards, layout, section, settings.seed)
     with io.replacing(models) as folder:

@@ -14,6 +14,7 @@ from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from reskin import io
 from reskin.errors import ParamsError
+from reskin.layouts import with_geometry
 from reskin.recordings.header import write_capture
 from reskin.simulation.capture import list_captures, simulate_capture, to_files
 from reskin.simulation.defaults import SHARED
@@ -23,7 +24,7 @@ from reskin.simulation.settings import SimulationSettings
 def physics(settings: Settings, physics: Path) -> None:
     """Write a scene's boards, and the nominal skin, rig, chip, spreads and terms, on which several stages depend."""
     simulation_settings(settings)  # raises an error if they are invalid
-    of_scene = {"boards": settings["simulate"]["boards"]}
+    of_scene = {"boards": {name: with_geometry(kind) for name, kind in settings["simulate"]["boards"].items()}}
     io.write_json(physics, of_scene | {name: settings.shared[name] for name in SHARED})
 
 

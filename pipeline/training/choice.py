@@ -24,6 +24,7 @@ from pipeline.scores import rows_of_cards
 from pipeline.statistics import over_folds
 from reskin.config import parse
 from reskin.errors import ParamsError
+from reskin.layouts import PAPER, geometry
 from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
@@ -168,11 +169,7 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
 # --- Fingerprint of the simulation: it changes only if the simulated fields or forces of given indentations change ---
 
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # scene quick uses the same rule
-BOARD = BoardDesign(
-    chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
-    chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),
-    gap_mm=1.1,
-)
+BOARD = parse(BoardDesign, geometry(PAPER)["design"], "reskin/layouts")
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
 DIGITS = 4  # number of significant digits; a change of the physics changes these digits, but rounding errors do not

@@ -29,7 +29,7 @@ from reskin.universal.batches import (
 from reskin.universal.calibration import LabelledPresses, LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.force import NORMAL_90
 from reskin.universal.layout import BoardLayout, as_layout, paper_layout, read_layout
-from reskin.universal.map import Estimate, tabulate
+from reskin.universal.map import NOMINAL, Estimate, tabulate
 from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import PLACES_N, Population, draw_population
@@ -55,8 +55,9 @@ CARD = {
     "skins: the place plus or minus 1.645 standard deviations contains the true place in 90 % of the readings",
     "made_in_s_of": "processor time of one core",
     "recorded_knowledge": "from two recorded boards: the form of the law, its slide, the force at which the slide ends "
-    "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), the direction of the "
-    "magnetisation, the length scales of the law's error, and the method by which forces are estimated",
+    f"(8 N), gap and amplitude ({NOMINAL.gap_mm:g} mm, {NOMINAL.amplitude:g}), how they vary together (0.95 per mm), "
+    "the direction of the magnetisation, the length scales of the law's error, and the method by which forces are "
+    "estimated",
 }
 SHIPPED = {  # additional entries in the card of the shipped model
     "name": "universal, simulated alone",

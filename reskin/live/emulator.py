@@ -34,7 +34,7 @@ from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 from reskin.simulation.capture import SimulatedCapture, list_captures, simulate_capture
-from reskin.simulation.defaults import NOMINAL, SHARED, nominal
+from reskin.simulation.defaults import SHARED, nominal
 from reskin.simulation.protocols import LIFTED_MM, Plan, Walk
 from reskin.simulation.settings import MAIN, parse_simulation
 
@@ -122,8 +122,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
     if source == NOMINAL_SOURCE:
-        settings = read_yaml(NOMINAL)
-        section = {name: settings[name] for name in ("boards", "protocols")}
+        section = {name: nominal(name) for name in ("boards", "protocols")}
         return simulate(section, SEED, source, board=board, robot=robot)
     if folder.suffix == ".yaml" and folder.is_file():
         scene = read_yaml(folder)

@@ -49,7 +49,7 @@ class BoardDesign(Strict):
     # places of the chips, relative to the centre of the board
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     chips_turn_deg: tuple[float, ...]  # rotation of each chip about z
-    # distance from the chips' sensing plane to the skin, such as 1.1 mm for rigid boards and 0.6 mm for flexible boards
+    # distance from the chips' sensing plane to the skin
     gap_mm: Annotated[float, Field(gt=0, le=10)]
     # If set, several boards of this design are under one skin, and the chips are numbered board by board.
     tiles: Tiles | None = None

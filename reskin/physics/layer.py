@@ -188,8 +188,7 @@ def force(
     """Return the normal force in N between a linear elastic layer and the tip, at each depth.
 
     The force is 0 at depths of 0 or less, because then the tip does not touch the layer. This function does not include
-    the stiffening of the layer at large depths. For simulated skins that slide on their base, use `slide.force_at`,
-    which includes it.
+    the stiffening of the layer at large depths, unlike `slide.force_at`.
 
     Raises
     ------

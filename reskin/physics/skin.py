@@ -41,7 +41,7 @@ class SkinDesign(Strict):
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
-    stiffening: Annotated[float, Field(ge=0, le=5)]  # exponent in `slide.stiffening_factor`; 0 is a linear elastic layer
+    stiffening: Annotated[float, Field(ge=0, le=5)]  # exponent of `slide.stiffening_factor`; 0 is linear elastic
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
 
     @model_validator(mode="after")
@@ -213,18 +213,21 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
     """Return the normal force in N between tip and skin at each commanded depth; a force is never negative.
 
     The force is that of a layer that is bonded to its base, or slips on it if the skin has `base: slipping` but no
-    `hold`, times `slide.stiffening_factor`. A skin with `hold` slides as a whole, but the friction under the tip holds
-    the material at the base.
+    `hold`, times `slide.stiffening_factor`. The material of a skin with `hold` moves as in a slipping layer; its force
+    assumes that the friction under the tip holds the base.
     """
     return _forces_at(skin, depth_m + skin.depth_zero_m)
 
 
 def _forces_at(skin: Skin, true_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    base = skin.base if skin.hold is None else "bonded"
-    elastic_N = layer.force(
-        true_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, modulus_Pa=skin.modulus_Pa, base=base
+    return slide.force_at(
+        true_m,
+        modulus_Pa=skin.modulus_Pa,
+        thickness_m=skin.thickness_m,
+        tip_radius_m=skin.tip_radius_m,
+        stiffening=skin.stiffening,
+        base=skin.base if skin.hold is None else "bonded",
     )
-    return elastic_N * slide.stiffening_factor(true_m, skin.thickness_m, skin.stiffening)
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -7,10 +7,11 @@ directions. With this model, the rigid motion of the skin follows from the displ
 normal force, there is therefore no motion (see `limit_by_friction`).
 
 The normal force is the force of an elastic layer that is bonded to its base (module `layer`), multiplied by the factor
-(1 - d/h)^-n, where d is the depth, h is the thickness and n is the `stiffening`. Although the skin slides, the friction
-under a press holds the material at the base. With n = 0, the layer is linear elastic. With n above 0, it becomes
-stiffer as it becomes thinner. The displacement due to a press is empirical: it was fitted to recorded boards, because
-the elastic layer alone does not describe the recordings.
+(1 - d/h)^-n, where d is the depth, h is the thickness and n is the `stiffening`. With n = 0, the layer is linear
+elastic. With n above 0, it becomes stiffer as it becomes thinner. The displacements of the material are those of a
+layer that slips on its base, but the force assumes that the friction under a press holds the base. The displacement of
+the whole skin due to a press is empirical: it was fitted to recorded boards, because the elastic layer alone does not
+describe the recordings.
 """
 
 from dataclasses import dataclass
@@ -46,8 +47,7 @@ class HoldDesign(Strict):
     give_um: tuple[float, float]
     # displacement towards the skin's centre due to a light press, divided by the distance from the centre
     away_um_mm: Annotated[float, Field(ge=0, le=100)]
-    # Force at which the displacement towards the centre vanishes. At smaller forces, this displacement decreases linearly
-    # with the force.
+    # Force at which the displacement towards the centre vanishes. Up to this force, it decreases linearly.
     lets_go_N: Annotated[float, Field(gt=0, le=1e6)]
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base, due to screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # friction coefficient between tip and skin
@@ -205,11 +205,17 @@ def _turn(rows, turn, move):
 
 
 def force_at(
-    depth_m: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float, stiffening: float
+    depth_m: Float[np.ndarray, " n"],
+    *,
+    modulus_Pa: float,
+    thickness_m: float,
+    tip_radius_m: float,
+    stiffening: float,
+    base: layer.Base = "bonded",
 ) -> Float[np.ndarray, " n"]:
-    """Return the normal force in N at each depth: the force of the bonded elastic layer times `stiffening_factor`."""
+    """Return the normal force in N at each depth: the force of an elastic layer times `stiffening_factor`."""
     elastic_N = layer.force(
-        depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base="bonded"
+        depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, modulus_Pa=modulus_Pa, base=base
     )
     return elastic_N * stiffening_factor(depth_m, thickness_m, stiffening)
 
@@ -224,9 +230,11 @@ def stiffening_factor(
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -stiffening
 
 
-def count_clipped(force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, **shape: float) -> int:
+def count_clipped(
+    force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float, stiffening: float
+) -> int:
     """Count the forces for which `depth_at` clips the depth, because they need a depth above its greatest depth."""
-    _, curve_m2 = _curve(**shape)
+    _, curve_m2 = _curve(thickness_m=thickness_m, tip_radius_m=tip_radius_m, stiffening=stiffening)
     return int((np.cbrt((np.maximum(force_N, 0.0) / modulus_Pa) ** 2) > curve_m2[-1]).sum())
 
 
@@ -252,8 +260,10 @@ def _curve(
     # Return equally spaced depths in m, and (F / E)^(2/3) at each depth, where F is the force and E is Young's modulus.
     deepest_m = min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
     curve_m = np.linspace(0, deepest_m, CURVE_N)
-    shape = {"thickness_m": thickness_m, "tip_radius_m": tip_radius_m, "stiffening": stiffening}
-    return curve_m, np.cbrt(force_at(curve_m, modulus_Pa=1.0, **shape) ** 2)
+    known_m2 = force_at(
+        curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m, stiffening=stiffening
+    )
+    return curve_m, np.cbrt(known_m2**2)
 
 
 def _rho2_m2(sides_m: tuple[float, float]) -> float:

@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 from scipy.constants import milli
 
 from reskin.config import Strict, parse
+from reskin.layouts import with_geometry
 from reskin.physics.board import BoardDesign, Spreads
 from reskin.physics.chip import ChipDesign
 from reskin.physics.magnet import QuadratureSettings
@@ -22,7 +23,10 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """Settings of one kind of board: how many boards and skins of this kind are simulated, and their design."""
+    """Settings of one kind of board: how many boards and skins of this kind are simulated, and their design.
+
+    In place of `design` and `skin_mm`, a file may name a `layout` of the folder `reskin/layouts`.
+    """
 
     letter: Annotated[str, Field(pattern="^[a-z]$")]  # first letter of the names of all boards and skins of this kind
     boards_n: Count
@@ -106,7 +110,9 @@ def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], wher
     shared : the sections of `nominal.yaml` that all simulations use; `terms` that no protocol lists are ignored
     where : name of the section for error messages
     """
-    protocols = section.get("protocols")
+    protocols, boards = section.get("protocols"), section.get("boards")
+    if isinstance(boards, Mapping):
+        section = {**section, "boards": {name: with_geometry(kind) for name, kind in boards.items()}}
     named = {
         term
         for protocol in (protocols.values() if isinstance(protocols, Mapping) else ())

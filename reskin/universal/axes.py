@@ -27,17 +27,14 @@ class BoardAxes:
     turns_deg : rotation of each chip about z, relative to the board
     labels_middle_mm : label (x, y) of the board's middle
     labels_mirrored : whether y of the labels points opposite to y of the board
-    stated_by : who has stated this orientation, for messages: the scene, or a layout
-    chips_key, middle_key : settings to correct if the chips or the places are wrong, for messages
+    stated_by : name of the layout that states this orientation, for messages
     """
 
     setup: Setup
     turns_deg: tuple[float, ...]
     labels_middle_mm: tuple[float, float]
     labels_mirrored: bool
-    stated_by: str = "the scene"
-    chips_key: str = "compare.design"
-    middle_key: str = "labels_middle_mm"
+    stated_by: str
 
     @cached_property
     def rotations(self) -> Float[np.ndarray, "k 3 3"]:
@@ -66,8 +63,8 @@ class BoardAxes:
         """
         chips_n, stated_n = presses.db_uT.shape[1], len(self.turns_deg)
         if chips_n != stated_n:
-            what = f"{chips_n} chips were recorded, but {self.chips_key} has {stated_n}"
-            remedy = f"Correct the chips in {self.chips_key} of the scene."
+            what = f"{chips_n} chips were recorded, but compare.layout has {stated_n}"
+            remedy = "Correct the chips in compare.layout of the scene."
             raise ParamsError(f"board {presses.board}: {what}. {remedy}")
         rest_uT = np.einsum("kij,kj->ki", self.rotations, presses.noload_uT.mean(axis=0))
         db_uT = np.einsum("kij,nkj->nki", self.rotations, presses.db_uT)

@@ -143,7 +143,7 @@ def describe_outside(place_mm: Float[np.ndarray, "n 2"], axes: BoardAxes) -> str
         f"{axis} from {low:.3g} to {high:.3g} mm"
         for axis, low, high in zip(AXES, place_mm.min(axis=0), place_mm.max(axis=0), strict=False)
     ]
-    key = axes.middle_key
+    key = "centre_mm"
     return (
         f"{outside_n} of {len(place_mm)} presses are outside the skin ({width_mm:g} x {height_mm:g} mm) that "
         f"{axes.stated_by} states: relative to {key} [{x_mm:g}, {y_mm:g}], all presses have "

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from reskin.physics import deformation, layer, magnet, slide
+from reskin.physics import deformation, magnet, slide
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
 from reskin.universal.presses import RecordedPresses, magnitudes_uT
@@ -91,13 +91,13 @@ class Law:
     # Under a press, the rig gives way. This displaces the skin by this vector, which is the same at all places.
     give_x_um: float
     give_y_um: float
-    # The following parameters are not fitted.
+    # The following parameters are neither in `TEN` nor in `SEVEN`.
     # The displacement `away_um_mm` decreases with the force of the press, and vanishes at this force. The value was
     # chosen on both boards of scene lab.
     lets_go_N: float = 8.0
-    # Exponent by which the force grows as the layer becomes thinner (`slide.stiffening_factor`). Fits to both boards of
-    # scene lab, with forces up to 9.5 N, gave about 1 (tools/fit_skin.py).
-    stiffening: float = 1.0
+    # Exponent by which the force grows as the layer becomes thinner (`slide.stiffening_factor`): mean of the fits to
+    # both boards of scene lab with forces up to 9.5 N, weighted by their uncertainties (docs/measured/skin.md).
+    stiffening: float = 1.2
     # Lateral stiffness (7 N/mm) divided by the friction coefficient (0.8), both from nominal.yaml, key skin.hold. It
     # limits the slide under a light press, because friction can then cause only a part of the displacement.
     grip_N_mm: float = 8.75
@@ -212,13 +212,14 @@ def nominal_uT(
 ) -> Float[np.ndarray, "n k 3"]:
     """Return the field changes of the nominal skin, which does not slide.
 
-    The depth of a press follows from its force according to `reskin.physics.layer`.
+    The depth of a press follows from its force according to `slide.force_at`.
     """
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
     table = setup.table(setup.design.tip_radius_mm)
-    return _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still) / micro
+    change_T = _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still)
+    return setup.start.amplitude * change_T / micro
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
@@ -245,9 +246,9 @@ def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndar
     The last depth is the greatest one for which the deformation is tabulated.
     """
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
-    curve_N = layer.force(
+    curve_N = slide.force_at(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
-        modulus_Pa=setup.design.modulus_kPa * kilo, base="slipping",
+        modulus_Pa=setup.design.modulus_kPa * kilo, stiffening=setup.design.stiffening,
     )  # fmt: skip
     return curve_N, curve_m
 
@@ -274,8 +275,8 @@ def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, 
 # fit starts, which is also the mean of the prior; in PRIOR the standard deviation of the prior; in STEP the typical
 # size of a change of the parameter, by which the optimiser scales the parameters.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
-PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
-STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
+PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0, lets_go_N=8.0, stiffening=1.0)
+STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0, lets_go_N=8.0, stiffening=1.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
 # Parameters that may differ between boards of a rig. If only these are fitted to a board, the other parameters come
@@ -339,8 +340,8 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
-    # The lower limits ensure that the skin is above its chips, is magnetised, and has some stiffness.
-    least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
+    # The lower limits ensure that the skin is above its chips, is magnetised, has some stiffness, and does not soften.
+    least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01, "lets_go_N": 0.5, "stiffening": 0.0}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
 
 

@@ -1,50 +1,37 @@
 """The layout of a board for which a universal model is made: its chips, its skin, the tip and the area of presses.
 
-A user writes a layout as a YAML file. The file `layouts/reskin.yaml` is an example, which explains each key.
+A user writes a layout as a YAML file. The file `reskin/layouts/reskin.yaml` is an example, which explains each key.
 """
 
 import math
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from reskin.config import Strict, parse, read_yaml
-from reskin.errors import ParamsError, did_you_mean
+from reskin.errors import did_you_mean
+from reskin.layouts import PAPER, ChipPlace, Coordinate, file_of
 from reskin.physics import slide
 from reskin.physics.board import CHIPS_MAX_N
 from reskin.physics.magnet import Polarity, Quadrature
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
-from reskin.simulation.defaults import nominal
+from reskin.simulation.defaults import filler
 from reskin.universal.law import COARSE, RULE, START, Area, Law, Setup, to_board, to_chips, with_parameters
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import THICKNESSES, TIPS, Forces
 
-FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
 FORCES_N = 9  # number of forces at which the map tabulates fields
 CHIPS_APART_MM = 0.5  # smallest distance between the centres of two chips, which is less than the width of a chip
 EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
 # Side of the paper's skin. For larger skins, the cells of the quadrature rule are larger in proportion.
 SIDE_MM = 20.0
 
-Coordinate = Annotated[float, Field(ge=-200, le=200)]
 Length = Annotated[float, Field(gt=0, le=200)]
-
-
-class ChipPlace(Strict):
-    """Position of a chip relative to the board's centre, and rotation of the chip's axes about z.
-
-    The rotation is counterclockwise if seen from above the skin. With 90, for example, the x axis of the chip points in
-    the direction of the board's y axis.
-    """
-
-    x_mm: Coordinate
-    y_mm: Coordinate
-    turn_deg: Literal[0, 90, 180, 270]
 
 
 class SkinStack(Strict):
@@ -190,7 +177,7 @@ class BoardLayout(Strict):
         """Return the setup for simulations of the nominal skin on this board."""
         skin = self.skin.model_dump(include={"thickness_mm", "polarity", "flipped"})
         changes = skin | {"tip_radius_mm": self.tip_radius_mm}
-        design = parse(SkinDesign, nominal("skin", changes), f"{NOMINAL_FILE}: skin")
+        design = parse(SkinDesign, filler() | changes, f"{NOMINAL_FILE}: skin")
         factor = max(1.0, max(self.skin.size_mm) / SIDE_MM)
         rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
         return Setup(
@@ -218,15 +205,7 @@ def read_layout(file: Path | str) -> BoardLayout:
     """
     path = Path(file)
     if path.suffix not in (".yaml", ".yml"):
-        known = sorted(own.stem for own in FOLDER.glob("*.yaml"))
-        if str(file) not in known:
-            guess = did_you_mean(file, known)
-            raise ParamsError(
-                f"{file}: this is neither a YAML file nor a layout that comes with the project "
-                f"({', '.join(known)}).{guess} To write your own layout, copy {FOLDER / 'reskin.yaml'} and edit the "
-                "copy."
-            )
-        path = FOLDER / f"{file}.yaml"
+        path = file_of(str(file))
     return as_layout(read_yaml(path), str(path))
 
 
@@ -241,4 +220,4 @@ def as_layout(value: Any, where: str) -> BoardLayout:
 @lru_cache(maxsize=1)
 def paper_layout() -> BoardLayout:
     """Return the layout of the paper's board."""
-    return read_layout("reskin")
+    return read_layout(PAPER)

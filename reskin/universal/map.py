@@ -51,7 +51,7 @@ FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light tou
 LOGARITHMIC = ("amplitude", "modulus_MPa")  # the spread of these parameters is the standard deviation of the logarithm
 # Spreads of the parameters. If other boards of the same rig are known, a skin's parameters differ from the mean of
 # these boards by `RIG_SPREADS`. If no board is known, they differ from the nominal parameters by `NOMINAL_SPREADS`. All
-# values are assumed. They are larger than the differences between the two recorded boards.
+# values are assumed.
 RIG_SPREADS = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
     "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
@@ -62,9 +62,10 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
 # Nominal parameters. The form of the law and the parameters gap, amplitude, `away_um_mm` and `lets_go_N` come from the
-# recorded boards of scene lab. Many other pairs of gap and amplitude fit a board about equally well. The modulus is a
-# usual value for the silicone Dragon Skin 10 with filler (150 to 230 kPa). See `Law` for the meaning of each parameter.
-NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
+# recorded boards of scene lab. Many other pairs of gap and amplitude fit a board about equally well. The modulus
+# belongs to the stiffening of `Law`; simulated scenes have another pair (nominal.yaml: 330 kPa, no stiffening). See
+# `Law` for the meaning of each parameter.
+NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.5, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
 # To compute a derivative by finite differences, each parameter is changed by this value times its spread.
 STEP = 0.4
 

@@ -9,16 +9,16 @@ import pytest
 from pipeline.experiments.extremes import CASES, physics
 from pipeline.experiments.extremes.cases import Case, World
 from reskin.board import stream
-from reskin.config import parse, read_yaml
+from reskin.config import read_yaml
 from reskin.models import inputs, train
 from reskin.physics import aging, chip, deformation, layer, magnet, slide
 from reskin.simulation import contact
 from reskin.simulation.defaults import nominal
-from reskin.simulation.settings import SimulationSettings
+from reskin.simulation.settings import parse_simulation
 
 QUICK = Path(__file__).resolve().parents[2] / "pipeline/scenes/quick.yaml"
 SHARED = {name: nominal(name) for name in ("rig", "skin", "chip", "spreads", "terms")}
-WORLD = World(parse(SimulationSettings, SHARED | read_yaml(QUICK)["simulate"], "simulate"), 2021)
+WORLD = World(parse_simulation(read_yaml(QUICK)["simulate"], SHARED, "simulate"), 2021)
 BY_NAME = {case.name: case for case in CASES}
 
 
@@ -103,7 +103,11 @@ FAULTS = {
     "rings_slipping_1": (layer, "_kernel", lambda original: lambda *args: 1.1 * original(*args)),
     "far_field": (deformation, "displacement", stretched),
     "depth_0.72": (deformation, "move_dipoles", without_rotation),
-    "thickness_20mm": (slide, "stiffening_factor", lambda _: lambda depth_m, *others: 1 + np.maximum(depth_m, 0) / 1e-3),
+    "thickness_20mm": (
+        slide,
+        "stiffening_factor",
+        lambda _: lambda depth_m, *others: 1 + np.maximum(depth_m, 0) / 1e-3,
+    ),
     "lifted_drag": (contact, "_in_series", lambda _: lambda layers, base: layers[:, None, None] * np.eye(2)),
     "stiff_relaxation": (aging, "_mean_decay", naive_quotient),
     "steps": (chip, "STEP_AT_GAIN_ONE_uT", lambda _: (0.161, 0.161, 0.294)),

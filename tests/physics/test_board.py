@@ -25,6 +25,8 @@ SPREADS = {
     "skin_modulus": 0.1,
     "skin_seat_mm": 0.25,
     "skin_rotation_deg": 0.7,
+    "skin_give_um": 10.0,
+    "skin_away_um_mm": 3.0,
     "skin_depth_zero_mm": 0.05,
 }
 

@@ -4,6 +4,8 @@ It is compared with a loop over all dipoles, and tested for symmetries, pokes wi
 that slide.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,6 +44,7 @@ def design(**changes):
         "half_field_T": 0.5,
         "thickness_mm": 2.0,
         "modulus_kPa": 190.0,
+        "stiffening": 0.0,
         "tip_radius_mm": 3.0,
     }
     return SkinDesign(**(usual | changes))
@@ -340,21 +343,34 @@ def test_skin_held_by_springs_slides_as_a_rigid_body_up_to_the_friction_limit():
     # `press_displacement_m`). Friction allows the fraction `share` of this move.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
-    taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
+    taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / 8) * away_m
     needed_N = 7e3 * np.linalg.norm(slide.rigid_motion(away_m[None], taken_m[None], one.sides_m).move_m)
     share = 1 - np.exp(-0.8 * normal_N / needed_N)
     assert 0.2 < share < 0.9
     nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))
     np.testing.assert_allclose(apart_m[nearest, :2], share * taken_m, atol=2e-6)
-    without_slide = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
+    alike = spreads(skin_give_um=0.0, skin_away_um_mm=0.0)
+    without_slide = held_skin(alike, give_um=(0.0, 0.0), away_um_mm=0.0)
     np.testing.assert_array_equal(change(poke_m[0], without_slide), change(poke_m[0], free))
 
 
-def test_force_on_a_skin_held_by_springs_grows_faster_with_depth():
-    one, free = held_skin(EXACT), skin(base="slipping")
-    depth_m = np.array([0.4e-3, 1.0e-3])
+def test_force_on_a_skin_held_by_springs_is_that_of_a_bonded_layer_times_its_stiffening():
+    one, bonded, depth_m = held_skin(EXACT), skin(base="bonded"), np.array([0.4e-3, 1.0e-3])
+    np.testing.assert_array_equal(forces(one, depth_m), forces(bonded, depth_m))
     stiffer = (1 - depth_m / one.thickness_m) ** -1.5
-    np.testing.assert_allclose(forces(one, depth_m), stiffer * forces(free, depth_m), rtol=1e-9)
+    for other in (one, bonded):
+        found_N = forces(replace(other, stiffening=1.5), depth_m)
+        np.testing.assert_allclose(found_N, stiffer * forces(bonded, depth_m), rtol=1e-12)
+
+
+def test_drawn_skins_differ_in_how_they_slide():
+    holds = [skin(UNEVEN, f"s{i}", SPARSE, base="slipping", hold=HELD).hold for i in range(100)]
+    # The tolerance is three and a half standard errors, as above.
+    give_m = np.array([hold.give_m for hold in holds])
+    np.testing.assert_allclose(give_m.mean(axis=0), (48e-6, 7e-6), atol=3.5e-6)
+    assert np.std(give_m - give_m.mean(axis=0)) == pytest.approx(10e-6, rel=0.25)
+    assert np.std([hold.away for hold in holds]) == pytest.approx(3e-3, rel=0.25)
+    assert held_skin(EXACT).hold == slide.HoldDesign(**HELD).in_si()
 
 
 def test_bonded_skin_held_by_springs_is_refused():

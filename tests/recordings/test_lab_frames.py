@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 from scipy.constants import micro, milli
 from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 
-from pipeline import SCENES
 from reskin.config import parse
+from reskin.layouts import PAPER, geometry
 from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
 from reskin.simulation.defaults import nominal
-from tests.physics.test_board import SPREADS, as_tuples
+from tests.physics.test_board import SPREADS
 from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,9 +31,7 @@ MIDDLE_MM = 8.0
 
 @pytest.fixture(scope="module")
 def design() -> BoardDesign:
-    scene = YAML(typ="safe").load((ROOT / SCENES / "quick.yaml").read_text())
-    values = scene["simulate"]["boards"]["rigid"]["design"]
-    return parse(BoardDesign, {name: as_tuples(value) for name, value in values.items()}, "test")
+    return parse(BoardDesign, geometry(PAPER)["design"], "test")
 
 
 @pytest.fixture(scope="module")

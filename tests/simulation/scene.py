@@ -56,6 +56,7 @@ SECTIONS = {
         "half_field_T": 0.8,
         "thickness_mm": 2.0,
         "modulus_kPa": 345.0,
+        "stiffening": 0.0,
         "tip_radius_mm": 3.0,
     },
     "chip": {"gain_sel": 6, "noise_xy_uT": 3.3, "noise_z_uT": 5.0, "noise_temperature_degC": 0.1},

@@ -8,10 +8,10 @@ import pytest
 from pipeline.training.choice import fingerprint
 from reskin.config import read_yaml
 from reskin.physics import slide
-from reskin.simulation.defaults import NOMINAL
+from reskin.simulation.defaults import SHARED, nominal
 
 ROOT = Path(__file__).resolve().parents[2]
-PARAMS = read_yaml(NOMINAL)
+PARAMS = {name: nominal(name) for name in SHARED}
 CURRENT = fingerprint(PARAMS)
 
 

@@ -33,7 +33,7 @@ def make_rows() -> Rows:
 
 
 def test_recorded_readings_are_grouped_by_press():
-    axes = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True)
+    axes = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True, stated_by="a test")
     found = recorded_board(make_rows(), axes, "own", np.ones(15))
     assert found.db_uT.shape == (2, READINGS_N, 15)
     np.testing.assert_allclose(found.place_mm, [[0, 0], [1, -1]])

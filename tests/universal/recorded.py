@@ -4,19 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
-from reskin.config import parse, read_yaml
-from reskin.physics.skin import SkinDesign
+from reskin.config import read_yaml
 from reskin.seeds import rng_for
-from reskin.simulation.defaults import nominal
 from reskin.universal import law
 from reskin.universal.presses import RecordedPresses
 
 LAB = Path(__file__).resolve().parents[2] / "pipeline/scenes/lab.yaml"
-# The nominal skin is pressed with the same tip as the boards, because tables for another tip would take seconds to
-# compute.
-DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "nominal.yaml: skin")
-AXES = parse(Compare, read_yaml(LAB)["compare"], "lab.yaml: compare").axes(DESIGN)
+AXES = Settings("lab", str(LAB), read_yaml(LAB), {}).section(Compare, "compare").axes
 SETUP = AXES.setup
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 

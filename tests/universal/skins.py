@@ -7,17 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from reskin.config import parse
-from reskin.physics.skin import SkinDesign
-from reskin.simulation.defaults import nominal
-from reskin.universal.law import Setup
+from reskin.universal.layout import paper_layout
 from reskin.universal.map import Tables, lattice_mm
 from reskin.universal.population import PRESSES_N, Population, draw_places
 
 ROOT = Path(__file__).resolve().parents[2]
 CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])
-DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
-SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
+SETUP = paper_layout().setup()
 WIDE_MM = 5.0
 # The tables give the fields at these forces. Few forces are enough, because the formula is smooth in the force.
 FORCES_N = np.geomspace(0.55, 9.5, 6)

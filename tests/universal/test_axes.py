@@ -5,7 +5,7 @@ import numpy as np
 from reskin.universal.axes import BoardAxes
 from tests.universal.skins import SETUP
 
-AXES = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True)
+AXES = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True, stated_by="a test")
 
 
 def test_places_and_fields_are_converted_to_the_axes_of_the_board():

@@ -10,16 +10,16 @@ from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
+from reskin.layouts import FOLDER
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
 from reskin.universal.axes import BoardAxes
 from reskin.universal.frames import TURNS, find_departure, frames_of, quarter_turn
 from reskin.universal.law import nominal_uT
-from reskin.universal.layout import FOLDER
 from reskin.universal.presses import RecordedPresses
 from tests.data.tables import readings
 from tests.recordings.test_recordings import ingest
-from tests.universal.recorded import AXES, DESIGN, simulated_presses
+from tests.universal.recorded import AXES, simulated_presses
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +32,19 @@ def sentence(pokes: RecordedPresses) -> str:
 
 
 def test_presses_that_agree_with_the_scene_are_oriented_as_stated(recorded):
-    assert sentence(recorded) == "Labels, chips and skin are oriented as the scene states."
+    assert sentence(recorded) == "Labels, chips and skin are oriented as layout reskin states."
 
 
 def test_exchanged_chips_are_found(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
-    assert sentence(swapped) == "Contrary to the scene, chips 1 and 2 are exchanged."
+    assert sentence(swapped) == "Contrary to layout reskin, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_axis_along_which_all_chips_are_mirrored_is_reported(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
-        f"Contrary to the scene, all chips are mirrored along {'xyz'[axis]}."
+        f"Contrary to layout reskin, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
@@ -52,7 +52,7 @@ def test_rotated_chip_is_reported(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
-        "Contrary to the scene, chip 3 is turned by 90 degrees more than the scene says."
+        "Contrary to layout reskin, chip 3 is turned by 90 degrees more than layout reskin says."
     )
 
 
@@ -61,13 +61,13 @@ def test_axis_along_which_labels_are_mirrored_is_reported(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
-        f"Contrary to the scene, the labels are mirrored along {'xy'[axis]}."
+        f"Contrary to layout reskin, the labels are mirrored along {'xy'[axis]}."
     )
 
 
 def test_skin_with_exchanged_poles_is_reported(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
-    assert sentence(flipped) == "Contrary to the scene, the skin is flipped: every field has the opposite sign."
+    assert sentence(flipped) == "Contrary to layout reskin, the skin is flipped: every field has the opposite sign."
 
 
 def test_sixteen_orientations_of_a_skin_are_distinct():
@@ -96,12 +96,12 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(real):
 def test_exchanged_chips_are_reported(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
-    assert find_departure([swapped], AXES) == "Contrary to the scene, chips 1 and 2 are exchanged."
+    assert find_departure([swapped], AXES) == "Contrary to layout reskin, chips 1 and 2 are exchanged."
 
 
 def test_mirrored_labels_are_reported(real):
     mirrored = replace(real, y_mm=16 - real.y_mm)
-    assert find_departure([mirrored], AXES) == "Contrary to the scene, the labels are mirrored along y."
+    assert find_departure([mirrored], AXES) == "Contrary to layout reskin, the labels are mirrored along y."
 
 
 def test_no_departure_is_reported_without_places_or_with_too_few_presses(real):
@@ -110,7 +110,7 @@ def test_no_departure_is_reported_without_places_or_with_too_few_presses(real):
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
     for cannot in (replace(real, x_mm=unknown), few):
         assert find_departure([cannot], AXES) is None
-    with pytest.raises(ParamsError, match=r"4 chips were recorded, but compare\.design has 5"):
+    with pytest.raises(ParamsError, match=r"4 chips were recorded, but compare\.layout has 5"):
         find_departure([fewer_chips], AXES)
 
 
@@ -118,7 +118,7 @@ def test_mirrored_labels_are_reported_although_forces_are_unknown(real):
     unknown = np.full(len(real), np.nan, np.float32)
     assert find_departure([replace(real, Fz_N=unknown)], AXES) is None
     mirrored = replace(real, Fz_N=unknown, y_mm=16 - real.y_mm)
-    assert find_departure([mirrored], AXES) == "Contrary to the scene, the labels are mirrored along y."
+    assert find_departure([mirrored], AXES) == "Contrary to layout reskin, the labels are mirrored along y."
 
 
 # This is the layout of a square board with four chips, as it is written in the file of a scene.
@@ -134,7 +134,7 @@ SQUARE = read_yaml(FOLDER / "reskin.yaml") | {
 
 def square_axes() -> BoardAxes:
     scene = {"compare": {"layout": SQUARE, "labels_mirrored": False}}
-    return Settings("mine", "mine.yaml", scene, {}).section(Compare, "compare").axes(DESIGN)
+    return Settings("mine", "mine.yaml", scene, {}).section(Compare, "compare").axes
 
 
 def square_recording(axes: BoardAxes) -> Readings:

@@ -8,7 +8,7 @@ import pytest
 from reskin.physics import layer
 from reskin.universal import law
 from reskin.universal.frames import quarter_turn
-from tests.universal.recorded import AXES, DESIGN, SETUP, TRUE, simulated_presses
+from tests.universal.recorded import AXES, SETUP, TRUE, simulated_presses
 
 # The tolerances are the errors of a fit to 50 presses with 3 uT of noise. The tolerances of gap and amplitude are
 # large, because an error of the gap can be compensated by an error of the amplitude.
@@ -42,22 +42,21 @@ def test_flipped_checkerboard_skin_equals_the_skin_rotated_by_a_quarter_turn():
 
 
 def test_fields_of_the_law_without_slide_equal_those_of_the_nominal_skin():
-    plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
-    setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
+    plain = law.Law(0.0, 0.0, 0.0, SETUP.gap_mm, SETUP.start.amplitude, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
-    nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
+    nominal_uT = law.nominal_uT(SETUP, place_mm, np.array([0.5, 0.5]))
     # The depth of `nominal_uT` is fixed, so the force of this depth is found by trying many forces.
     lengths = [
-        np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N)))
+        np.linalg.norm(nominal_uT - law.simulate_uT(plain, SETUP, place_mm, np.full(2, force_N)))
         for force_N in np.geomspace(0.2, 8, 30)
     ]
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
 def test_presses_deeper_than_the_greatest_depth_get_the_field_of_this_depth():
-    deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
+    deepest_m = np.array([0.72e-3 * SETUP.design.thickness_mm])
     layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
-    (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
+    (deepest_N,) = layer.force(deepest_m, **layer_settings, base="bonded") * 0.28**-TRUE.stiffening
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
     # The skin does not slide here, because the slide would change the field with the force even at a constant depth.

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from reskin.errors import ParamsError
+from reskin.layouts import FOLDER
 from reskin.physics.board import BoardDesign
 from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal import law
-from reskin.universal.layout import FOLDER, paper_layout, read_layout
+from reskin.universal.layout import paper_layout, read_layout
 from reskin.universal.map import FORCES_N, NOMINAL, NOMINAL_SPREADS, lattice_mm
 from reskin.universal.population import DEFAULT_FORCES, draw_places, grid
 
@@ -24,7 +25,8 @@ def test_layout_of_the_papers_board_equals_the_constants_of_the_shipped_model():
     ).model_dump_json())  # fmt: skip
     assert [tuple(place) for place in setup.chips_mm.tolist()] == list(rigid.chips_xy_mm)
     assert layout.turns_deg == rigid.chips_turn_deg
-    assert setup.design == SkinDesign.model_validate(nominal("skin") | {"hold": setup.design.hold})
+    filler_T, skin = setup.design.saturation_T, SkinDesign.model_validate(nominal("skin") | {"hold": setup.design.hold})
+    assert skin == setup.design.model_copy(update={"saturation_T": filler_T * layout.skin.magnetisation})
     assert (setup.rule, setup.coarse_rule, setup.area) == (law.RULE, law.COARSE, law.PAPER_AREA)
     assert (layout.law, layout.all_spreads, layout.forces) == (NOMINAL, NOMINAL_SPREADS, DEFAULT_FORCES)
     np.testing.assert_array_equal(layout.tabulated_N, FORCES_N)
@@ -109,6 +111,6 @@ def test_missing_layout_files_are_reported(tmp_path):
     with pytest.raises(ParamsError, match="none.yaml: file not found"):
         read_layout(tmp_path / "none.yaml")
     with pytest.raises(
-        ParamsError, match="reskim: this is neither a YAML file nor .*anyskin, eflesh, reskin.*Did you mean reskin"
+        ParamsError, match="reskim: this is neither a YAML file nor .*anyskin, eflesh, .*reskin.*Did you mean reskin"
     ):
         read_layout("reskim")

@@ -33,7 +33,7 @@ def test_presses_are_means_of_the_readings_with_a_force():
     assert pokes.groups == ("c0 1 mm",)
     with pytest.raises(SchemaError, match="experiment compare: board .* has no press with a known place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
-    with pytest.raises(ParamsError, match="1 chips were recorded, but compare.design has 5"):
+    with pytest.raises(ParamsError, match="1 chips were recorded, but compare.layout has 5"):
         AXES.align(pokes)
 
 

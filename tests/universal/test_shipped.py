@@ -12,6 +12,7 @@ from reskin import io
 from reskin.config import parse, read_yaml
 from reskin.data.rows import Rows
 from reskin.errors import SchemaError
+from reskin.layouts import PAPER, geometry
 from reskin.physics import slide
 from reskin.physics.board import BoardDesign, Spreads, draw_board
 from reskin.physics.chip import ChipDesign, read_field
@@ -25,11 +26,11 @@ from reskin.universal.map import NOMINAL
 from reskin.universal.model import FILE, PriorModel, Universal, load_universal
 
 ROOT = Path(__file__).resolve().parents[2]
-PARAMS = read_yaml(defaults.NOMINAL)
+PARAMS = {name: defaults.nominal(name) for name in defaults.SHARED}
 PARAMS_SKIN, SPREADS = parse(SkinDesign, PARAMS["skin"], "skin"), parse(Spreads, PARAMS["spreads"], "spreads")
 CHIP = parse(ChipDesign, PARAMS["chip"], "chip")
 QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]
-RIGID = parse(BoardDesign, QUICK["boards"]["rigid"]["design"], "boards")
+RIGID = parse(BoardDesign, geometry(PAPER)["design"], "layout")
 PLACES_MM = np.array([[8.0, 8.0], [3.0, 6.0], [12.0, 11.0], [10.0, 3.0]])
 
 
@@ -395,7 +396,8 @@ def test_median_force_of_light_touches_on_new_skins_is_within_40_percent(force_N
     for name in ("b0", "b1", "b2", "b3"):
         board = draw_board(RIGID, SPREADS, seed=5, name=name)
         skin = draw_skin(PARAMS_SKIN, SPREADS, seed=5, name=f"{name}_s0", rule=Quadrature(0.8e-3, 5))
-        layer = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
+        names = ("thickness_m", "tip_radius_m", "modulus_Pa", "stiffening")
+        layer = {name: getattr(skin, name) for name in names}
         depth_m = slide.depth_at(np.full(10, force_N), **layer) - skin.depth_zero_m
         rest_T, change_T = changes_of_field(board, skin, np.column_stack([rng.uniform(-7e-3, 7e-3, (10, 2)), depth_m]))
         noload_uT, _ = read_field(np.repeat(rest_T[None], 50, axis=0), board, design=CHIP, rng=rng)
