@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 
 FILE = Path(__file__).with_suffix(".yaml")
 WAVES_N = 48  # the smooth random error is a sum of this number of random cosines
+FORCE_TICKS_N2 = (0.2, 0.5, 1, 2)
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 # For each row of table 2, the experiment whose networks the row scores.
 ROWS = {"transfer": "single", "lobo": "multi", "triplet": "triplet", "adapt": "adapted"}
@@ -184,7 +186,7 @@ def scores_of(data: SceneData) -> Iterator[dict[str, Any]]:
 
 def draw(table: pd.DataFrame) -> str:
     """Draw accuracy and MSE_F of each row of table 2 in each world, and of the paper; return the figure as SVG."""
-    labels = {"accuracy_pct": "readings within 1 mm / %", "mse_f_N2": "MSE of the force / N²"}
+    labels = {"accuracy_pct": "within 1 mm / %", "mse_f_N2": "MSE_F / N²"}
     names = list(table["world"].unique())
     with drawing(1.2 + 0.45 * len(names), "Rows of table 2 in simulated worlds and in the paper") as figure:
         panels = figure.subplots(1, len(labels), sharey=True)
@@ -192,10 +194,11 @@ def draw(table: pd.DataFrame) -> str:
             for shift, (row, of_row) in enumerate(table.groupby("row", sort=False)):
                 y = [names.index(name) + 0.15 * (shift - 1.5) for name in of_row["world"]]
                 axes.plot(of_row[metric], y, "o", label=ROW_NAMES[str(row)])
-            axes.set(xlabel=label, yticks=range(len(names)), yticklabels=names)
-        panels[1].set(xscale="log")
+            axes.set(xlabel=label, yticks=range(len(names)), yticklabels=[fill(name, 20) for name in names])
+        panels[1].set(xscale="log", xticks=FORCE_TICKS_N2, xticklabels=map(str, FORCE_TICKS_N2))
+        panels[1].minorticks_off()
         panels[0].invert_yaxis()
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         return svg(figure)
 
 
