@@ -11,7 +11,6 @@
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
 `simulate_recording`                   the recording of a simulated board, with the same files that `record` writes
 `ContactRegressor`                     the paper's network as an estimator of scikit-learn
-`UniversalRegressor`                   the universal model as an estimator of scikit-learn
 `SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
 =====================================  ==========================================================
 
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
     )
     from reskin.estimators import SCORERS as SCORERS
     from reskin.estimators import ContactRegressor as ContactRegressor
-    from reskin.estimators import UniversalRegressor as UniversalRegressor
 
 __all__ = [
     "Model",
@@ -71,7 +69,7 @@ __all__ = [
     "touch",
 ]
 # Names that need scikit-learn. They are not in `__all__`, so that `from reskin import *` works without it.
-_ESTIMATORS = ("SCORERS", "ContactRegressor", "UniversalRegressor")
+_ESTIMATORS = ("SCORERS", "ContactRegressor")
 
 
 def __getattr__(name: str) -> Any:

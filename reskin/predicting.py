@@ -18,7 +18,7 @@ from reskin.logs import Estimator, LogEstimates, describe, estimate, quiet_start
 from reskin.models.trained import SUFFIX, Network, read_network
 from reskin.recordings import tables
 from reskin.recordings.loading import read_any_log
-from reskin.universal.calibration import is_calibration
+from reskin.universal.calibration import is_skin
 from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
 # The model can estimate only forces in a certain range. An estimated force is said to be at a limit of this range if it
@@ -33,7 +33,6 @@ def predict(
     *,
     rate_hz: float = 400.0,
     external_uT: float = 0.0,
-    new_day: bool = False,
 ) -> dict[str, Any]:
     """Estimate the contacts in a log, and write them to a CSV file.
 
@@ -53,19 +52,16 @@ def predict(
         Number of frames per second. It is used only for a table without times.
     external_uT
         Size of the external fields on a board that moves (see `load_universal`). Only for the universal model.
-    new_day
-        Whether the calibration was saved on an earlier day (see `load_universal`).
 
     Returns
     -------
     dict
         A summary of the log (see `reskin.logs.describe`), and counts of dropped frames. For the universal model, there
         are further entries. Two of them count doubtful readings in contact: those whose misfit is above `MISFIT_MAX`,
-        and those whose force is at a limit of the model's range. Another entry states whether the skin is turned by 90
-        degrees, and the last one lists the model's warnings.
+        and those whose force is at a limit of the model's range. The last entry lists the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
-    models = read_models(files, external_uT, new_day=new_day)
+    models = read_models(files, external_uT)
     if len(files) > 1 and not isinstance(models, Universal):
         raise ParamsError(f"{files[1]}: only one network can be used for a log. Use --model only once.")
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
@@ -97,24 +93,22 @@ class _UniversalOfLog:
         self._misfit = np.empty(0)
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        result = self._model.estimate(db_uT + self._model.noload_uT)
-        self._misfit = result.misfit
+        b_uT = db_uT + self._model.noload_uT
+        result, self._misfit = self._model.estimate(b_uT), self._model.misfit(b_uT)
         return np.column_stack([result.place_mm, result.force_N]).astype(np.float32)
 
     def count_suspects(self, estimates: LogEstimates) -> dict[str, Any]:
         """Count the readings in contact whose estimates are doubtful.
 
         These are the readings whose misfit is above `MISFIT_MAX`, and the readings whose estimated force is at a limit
-        of the model's range. The result also states whether the skin is turned by 90 degrees, and contains the warnings
-        of the model.
+        of the model's range. The result also contains the warnings of the model.
         """
         force_N = estimates.targets[0, estimates.contact, 2]
-        lowest_N, highest_N = self._model.tables.force_N[[0, -1]]
+        lowest_N, highest_N = self._model.layout.force_N
         at_limit = (force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)
         return {
             "unknown_skin_readings_n": int((self._misfit[estimates.contact] > MISFIT_MAX).sum()),
             "force_at_limit_readings_n": int(at_limit.sum()),
-            "skin_turned": self._model.mounting.turned,
             "model_warnings": self._model.warnings,
         }
 
@@ -135,24 +129,17 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def read_models(
-    files: Sequence[Path], external_uT: float = 0.0, *, new_day: bool = False
-) -> Sequence[Network] | Universal:
+def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Network] | Universal:
     """Read the models in the given files.
 
     `files` may contain one or several trained networks, a universal model, a calibration, or a universal model and a
     calibration of it. A calibration without a universal model is one of the universal model that comes with the
     library. If `files` is empty, this universal model is returned without a calibration.
 
-    `external_uT` and `new_day` are explained in `load_universal`. `external_uT` must be 0 for networks. `new_day` can
-    be True only with a calibration.
+    `external_uT` is explained in `load_universal`. It must be 0 for networks.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
-    if new_day and not calibrations and all(file.exists() for file in files):
-        raise ParamsError(
-            "--new-day: there is no calibration of an earlier day. Pass a saved calibration with --model."
-        )
     if not (made or calibrations):
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
@@ -164,12 +151,12 @@ def read_models(
         remedy = "Pass only this file, or one universal model and one calibration."
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
     calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
-    return load_universal(calibration, file=model, external_uT=external_uT, new_day=new_day)
+    return load_universal(calibration, file=model, external_uT=external_uT)
 
 
 def _is_calibration(file: Path) -> bool:
     try:
-        return is_calibration(file)
+        return is_skin(file)
     except SchemaError:
         if file.suffix == SUFFIX:
             raise

@@ -1,24 +1,21 @@
 """Tests of the estimators: scikit-learn's conventions, and equality with the project's training and calibration."""
 
-import pickle
 import warnings
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupKFold, cross_validate
 from sklearn.utils.estimator_checks import check_estimator
 
 import reskin
 from reskin import metrics
 from reskin.config import parse, read_yaml
-from reskin.errors import ParamsError, ReskinError, SchemaError, TrainingError
+from reskin.errors import ParamsError, SchemaError, TrainingError
 from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import Recipe
 from reskin.models.train import train_stack
-from reskin.seeds import rng_for
 from tests.models.example_jobs import some_rows
 from tests.test_api import ROOT
 
@@ -27,28 +24,11 @@ CONTACT_FAILS = dict.fromkeys(["check_methods_sample_order_invariance", "check_m
 OTHER_DATA = (
     "the check fits data with another number of channels than the board has, or other targets than x, y and force"
 )
-UNIVERSAL_FAILS = dict.fromkeys(
-    [
-        "check_dict_unchanged", "check_dont_overwrite_parameters", "check_dtype_object", "check_estimators_dtypes",
-        "check_estimators_fit_returns_self", "check_estimators_nan_inf", "check_estimators_overwrite_params",
-        "check_estimators_pickle", "check_f_contiguous_array_estimator", "check_fit2d_1feature", "check_fit2d_1sample",
-        "check_fit2d_predict1d", "check_fit_check_is_fitted", "check_fit_idempotent", "check_fit_score_takes_y",
-        "check_methods_sample_order_invariance", "check_methods_subset_invariance", "check_n_features_in",
-        "check_n_features_in_after_fitting", "check_pipeline_consistency", "check_positive_only_tag_during_fit",
-        "check_readonly_memmap_input", "check_regressor_data_not_an_array", "check_regressors_int",
-        "check_regressors_no_decision_function", "check_regressors_train", "check_supervised_y_2d",
-    ],
-    OTHER_DATA,
-)  # fmt: skip
 TITLES = {"steps_n": 4, "batch_n": 16}
 
 
-@pytest.mark.parametrize(
-    ("estimator", "fails"),
-    [(reskin.ContactRegressor(steps_n=15), CONTACT_FAILS), (reskin.UniversalRegressor(np.zeros(15)), UNIVERSAL_FAILS)],
-    ids=["ContactRegressor", "UniversalRegressor"],
-)
-def test_estimators_pass_the_checks_of_scikit_learn(estimator, fails):
+def test_estimator_passes_the_checks_of_scikit_learn():
+    estimator, fails = reskin.ContactRegressor(steps_n=15), CONTACT_FAILS
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # scikit-learn warns of the checks that it skips
         checks = check_estimator(estimator, expected_failed_checks=fails, on_skip=None)
@@ -145,91 +125,3 @@ def test_failed_training_raises_or_warns(monkeypatch):
     with pytest.warns(ConvergenceWarning, match="collapsed in all of 3 runs"):
         constant = reskin.ContactRegressor(**TITLES).fit(np.zeros_like(X), y)
     assert constant.network_.card["collapsed"]
-
-
-@pytest.fixture(scope="module")
-def pressed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return no-load readings, field changes and targets of presses of a simulated skin."""
-    rng = rng_for(0, "presses")
-    pokes = np.column_stack([rng.uniform(2, 14, (24, 2)), rng.uniform(0.4, 1.2, 24)])
-    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=1), pokes)
-    return noload_uT, (b_uT - noload_uT).astype(np.float64), np.column_stack([pokes[:, :2], force_N])
-
-
-def with_unknown(y: np.ndarray) -> np.ndarray:
-    """Return the targets with NaN for unknown values: six presses have place and force, three only a place."""
-    known = y.copy()
-    known[6:9, 2] = np.nan
-    known[9:] = np.nan
-    return known
-
-
-def test_universal_regressor_returns_the_estimates_of_the_universal_model(pressed):
-    noload_uT, X, y = pressed
-    known = with_unknown(y).astype(np.float32)
-    model = reskin.load_universal().zero(noload_uT)
-    b_uT = X + model.noload_uT
-    model.see(b_uT[9:], area=True).label(known[:6, :2], known[:6, 2], b_uT[:6])
-    model.label(known[6:9, :2], None, b_uT[6:9], keep=True)
-    expected = model.estimate(b_uT)
-
-    regressor = reskin.UniversalRegressor(noload_uT, spread="area").fit(X, with_unknown(y))
-    mean, std = regressor.predict(X, return_std=True)
-
-    np.testing.assert_array_equal(mean, np.column_stack([expected.place_mm, expected.force_N]))
-    np.testing.assert_array_equal(std[:, :2], expected.sd_mm)
-    np.testing.assert_array_equal(std[:, 2], expected.force_N * expected.sd_log_N)
-    assert (std > 0).all()
-    np.testing.assert_array_equal(regressor.predict(X), mean)
-
-
-def test_universal_regressor_follows_the_conventions_of_scikit_learn(pressed, tmp_path):
-    noload_uT, X, y = pressed
-    frame = pd.DataFrame(X, columns=[f"db{axis}{chip}_uT" for chip in range(5) for axis in "xyz"])
-    regressor = reskin.UniversalRegressor(noload_uT)
-    with pytest.raises(NotFittedError):
-        regressor.predict(frame)
-    before = [array.copy() for array in (noload_uT, X, y)]
-
-    assert regressor.fit(frame, y) is regressor
-    first = regressor.predict(frame)
-
-    assert all((array == copy).all() for array, copy in zip(pressed, before, strict=True))
-    assert regressor.noload_uT is noload_uT
-    assert list(regressor.feature_names_in_) == list(frame)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
-    # A second fit does not use the first one.
-    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)
-    np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
-    assert metrics.score(y, first)["accuracy_pct"] > 90  # the tested presses are the labelled ones
-    regressor.model_.save(tmp_path / "skin.safetensors")
-    saved = reskin.load_universal(tmp_path / "skin.safetensors")
-    # The tolerance allows for rounding of X + noload_uT.
-    np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)
-
-
-def test_universal_regressor_warns_of_mirrored_labels(pressed):
-    noload_uT, X, y = pressed
-    mirrored = y * [1, -1, 1] + [0, 16, 0]
-    with pytest.warns(UserWarning, match="mirrored"):
-        reskin.UniversalRegressor(noload_uT).fit(X, mirrored)
-
-
-def test_universal_regressor_refuses_wrong_data(pressed):
-    noload_uT, X, y = pressed
-    for regressor, changed, message in (
-        (reskin.UniversalRegressor(), y, "noload_uT is missing"),
-        (reskin.UniversalRegressor(noload_uT, spread="grid"), y, "spread must be anywhere, even or area; got 'grid'"),
-        (reskin.UniversalRegressor(noload_uT[:, :12]), y, "needs 15 numbers per reading"),
-        (reskin.UniversalRegressor(noload_uT), y[:, :2], r"y has shape \(24, 2\)"),
-        (reskin.UniversalRegressor(noload_uT), y * [np.nan, 1, 1], "row 0 of y has only one of x_mm and y_mm"),
-        (reskin.UniversalRegressor(noload_uT), y * [10, 10, 1], "on the skin"),
-    ):  # fmt: skip
-        with pytest.raises(ReskinError, match=message):
-            regressor.fit(X, changed)
-    for wrong, message in (
-        (X[:, :12], "X has 12 columns. This model needs 15"),
-        (X + noload_uT, "seem to be readings.* Pass field changes"),
-    ):
-        with pytest.raises(SchemaError, match=message):
-            reskin.UniversalRegressor(noload_uT).fit(wrong, y)

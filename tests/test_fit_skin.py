@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.universal.recorded import AXES, TRUE, simulated_presses
+from tests.fitting.recorded import AXES, TRUE, simulated_presses
 from tools import fit_skin
 
 

@@ -54,5 +54,5 @@ def test_examples_of_the_page_run(tmp_path, monkeypatch):
     finally:
         plt.close("all")
     assert {file.name for file in tmp_path.iterdir()} == {
-        "captures", "network.safetensors", "network.json", "b0_s0.safetensors",
+        "captures", "network.safetensors", "network.json",
     }  # fmt: skip

@@ -106,7 +106,7 @@ def shown(output: str, step: Step, folder: Path) -> str:
         first = max(i for i, line in enumerate(lines) if line.startswith(step.options["from"]))
         lines = [CUT, *lines[first:]]
     if "to" in step.options:
-        last = next(i for i, line in enumerate(lines) if i > 1 and line.startswith(step.options["to"]))
+        last = next(i for i, line in enumerate(lines) if i > 0 and line.startswith(step.options["to"]))
         lines = [*lines[: last + 1], CUT]
     return "".join(f"{line}\n" for line in lines)
 

@@ -28,11 +28,12 @@ import pandas as pd
 
 from pipeline.experiments.compare import agreement
 from pipeline.experiments.results import read_captures
+from pipeline.fitting.law_fit import AlignedPresses, fit
+from pipeline.fitting.presses import pool_skins
 from pipeline.settings import read_settings
 from pipeline.training.recorded import Compare
 from reskin.seeds import rng_for
-from reskin.universal.law import AlignedPresses, Setup, beyond_n, fit, simulate_uT
-from reskin.universal.presses import pool_skins
+from reskin.universal.law import Setup, beyond_n, simulate_uT
 
 FORCE_MAX_N = 4.5
 DRAWS_N = 10

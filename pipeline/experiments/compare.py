@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, write_results
+from pipeline.fitting.axes import BoardAxes
+from pipeline.fitting.frames import describe_outside, frames_of
+from pipeline.fitting.law_fit import SEVEN, TEN, AlignedPresses, fit
+from pipeline.fitting.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, pool_skins, thin
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
-from reskin.universal.axes import BoardAxes
-from reskin.universal.frames import describe_outside, frames_of
-from reskin.universal.law import SEVEN, TEN, AlignedPresses, Law, beyond_n, fit, nominal_uT, simulate_uT
-from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, pool_skins, thin
+from reskin.universal.law import Law, beyond_n, nominal_uT, simulate_uT
 
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 

@@ -144,11 +144,11 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
     for name, estimate in (
         *(("networks", by_network(network)) for network in networks),
-        ("map", by_universal(unlabelled)),
+        ("shipped", by_universal(unlabelled)),
     ):
         yield name, "none", estimate
         yield name, "factor", scale_to_press(estimate, press)
-    yield "map", "label", by_universal(labelled)
+    yield "shipped", "label", by_universal(labelled)
 
 
 def scale_to_press(estimate: Estimate, press: Press) -> Estimate:

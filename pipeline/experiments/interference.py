@@ -236,7 +236,7 @@ def place_rows(
         true, b_uT = presses.true[tested], presses.b_uT[tested]
         added = {key: each_uT[rng.integers(len(each_uT), size=len(tested))] for key, each_uT in changes_uT.items()}
         for external_uT, model in models.items():
-            model.zero(presses.noload_uT).see(presses.b_uT[known[:SEEN_N]], area=True)
+            model.zero(presses.noload_uT).see(presses.b_uT[known[:SEEN_N]])
             for labels_n in sorted(section.labels_n):
                 if labels_n:
                     place_mm, force_N = presses.true[known[:labels_n], :2], presses.true[known[:labels_n], 2]

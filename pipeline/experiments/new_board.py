@@ -225,13 +225,12 @@ def methods_of(board: Board, section: NewBoard, compare: Compare, models: Path, 
 def score_draw(board: Board, draw: Draw, section: NewBoard, methods: Methods, others: Samples) -> list[dict[str, Any]]:
     """Score every method on one draw, for each number of unlabelled presses and of labels."""
     readings = board.readings_of(draw.tested)
-    even = draw.split == GRID and len(draw.unlabelled) == count_places(board.presses)
     keys, rows = _keys(board, draw, len(readings)), []
     for name, versions in methods.items():
         for presses_n, labels_n in _settings(name, draw, section):
             presses_uT = board.presses.b_uT[draw.unlabelled[:presses_n]]
             labels = board.presses[draw.middle if labels_n == 1 else draw.labels[:labels_n]]
-            case = Case(board.noload_uT, presses_uT, labels, even, others, readings.b_uT)
+            case = Case(board.noload_uT, presses_uT, labels, others, readings.b_uT)
             for seed_i, method in enumerate(versions):
                 row = {"method": name, "seed": seed_i, "pokes_n": presses_n, "labels_n": labels_n}
                 rows.append(keys | row | score_prediction(readings, method(case)))

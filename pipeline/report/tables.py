@@ -50,7 +50,7 @@ LOGS = TURNING | {
     "missed_force_max_N": "largest force of a missed reading, N", "force_max_N": "largest estimated force, N",
     "force_true_max_N": "largest true force, N",
 }  # fmt: skip
-FORCE_FROM = {"networks": TITLES["multi"], "map": TITLES["shipped"]}
+FORCE_FROM = {"networks": TITLES["multi"], "shipped": TITLES["shipped"]}
 INTERFERENCE = {"rms_uT": "rms of changes, µT", "false_pct": "false contacts, %", "detected_pct": "detected presses, %"}
 COVERED = {"accuracy_pct": COLUMNS["accuracy_pct"], "coverage_pct": "in 90 % interval, %"}
 NEW_BOARD = {

@@ -45,8 +45,6 @@ class Case:
     """What a method knows about a new board, and the readings that it must estimate.
 
     - noload_uT: no-load field; presses_uT: unlabelled presses; labels: labelled presses.
-    - even: whether the unlabelled presses are one press at each place of a grid. Otherwise, they are at random places
-      all over the skin.
     - others: presses of the other boards, as changes of field.
     - tested_uT: the readings.
     """
@@ -54,7 +52,6 @@ class Case:
     noload_uT: Float[np.ndarray, " ch"]
     presses_uT: Float[np.ndarray, "n ch"]
     labels: Samples
-    even: bool
     others: Samples
     tested_uT: Float[np.ndarray, "t ch"]
 
@@ -82,16 +79,16 @@ class InContext:
     def __call__(self, case: Case) -> Prediction:
         model = reskin.load_universal(file=self.file)
         sign, origin_mm = np.array([1, -1 if self.mirrored else 1]), np.array(model.layout.centre_mm)
-        model.zero(case.noload_uT).see(case.presses_uT, even=case.even, area=not case.even)
+        model.zero(case.noload_uT).see(case.presses_uT)
         if len(case.labels):
             force_N = np.clip(case.labels.force_N, *model.layout.force_N)
             place_mm = (case.labels.place_mm - self.middle_mm) * sign + origin_mm
-            model.label(place_mm, None if np.isnan(force_N).any() else force_N, case.labels.b_uT)
+            model.label(place_mm, force_N, case.labels.b_uT)
         found = model.estimate(case.tested_uT)
-        place_mm, half_mm = (found.place_mm - origin_mm) * sign + self.middle_mm, NORMAL_90 * found.sd_mm
-        factor = np.exp(NORMAL_90 * found.sd_log_N)
-        low = np.column_stack([place_mm - half_mm, found.force_N / factor])
-        high = np.column_stack([place_mm + half_mm, found.force_N * factor])
+        place_mm = (found.place_mm - origin_mm) * sign + self.middle_mm
+        half_mm, half_N = NORMAL_90 * found.sd_mm, NORMAL_90 * found.sd_N
+        low = np.column_stack([place_mm - half_mm, found.force_N - half_N])
+        high = np.column_stack([place_mm + half_mm, found.force_N + half_N])
         return Prediction(np.column_stack([place_mm, found.force_N]), low, high)
 
 

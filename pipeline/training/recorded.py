@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.fitting.axes import BoardAxes
+from pipeline.fitting.law_fit import AlignedPresses
+from pipeline.fitting.presses import pool_skins
 from pipeline.settings import Row, SectionWithRows, Settings
 from reskin import io
 from reskin.data.rows import Rows, Selection, load_rows
 from reskin.errors import ParamsError
-from reskin.universal.axes import BoardAxes
-from reskin.universal.law import AlignedPresses
 from reskin.universal.layout import BoardLayout, read_layout
-from reskin.universal.presses import pool_skins
 
 
 class Compare(SectionWithRows):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from reskin.board.custom import CustomWire
 from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
@@ -43,10 +44,10 @@ UNCONFIRMED_MAX_N = 64  # largest number of sent messages for which a page's con
 UNKNOWN_CONTACT = (math.nan,) * 3
 # The head of a binary message: message number, number of chips, number of bins, and time of the last reading.
 HEAD = struct.Struct("<IHHd")
-# The head is followed by these numbers: x_mm, y_mm, F_N, the standard deviations of x and y, whether there is contact,
-# the frame rate, the number of lost bytes, four latencies in ms, the number of dropped frames, and the true x, y and F
-# of an emulated board. The last three numbers are NaN for real boards, and while nothing touches the skin.
-NUMBERS_N = 16
+# The head is followed by these numbers: x_mm, y_mm, F_N, the standard deviations of x, y and F, whether there is
+# contact, the frame rate, the number of lost bytes, four latencies in ms, the number of dropped frames, and the true x,
+# y and F of an emulated board. The last three numbers are NaN for real boards, and while nothing touches the skin.
+NUMBERS_N = 17
 
 PRESSES_N = 12  # number of presses anywhere for a calibration
 # The places for guided presses form a square grid. These are their coordinates along x and along y, relative to the
@@ -121,7 +122,7 @@ class Traces:
             1e3 * np.percentile(times_s, [50, 99]) if times_s else np.full(2, np.nan)
             for times_s in (self.to_estimate_s, self.to_screen_s)
         ]
-        now = [*last.target[-1], *last.sd_mm[-1], last.contact[-1], rate_hz, lost_bytes_n]
+        now = [*last.target[-1], *last.sd_mm[-1], last.sd_F_N[-1], last.contact[-1], rate_hz, lost_bytes_n]
         change_uT = np.einsum("kij,kj->ki", self._layout.turn, last.db_uT[-1].reshape(-1, 3).astype(np.float64))
         t_s = float(last.t_s[-1]) - self._start_s
         head = HEAD.pack(self._message_i % 2**32, self._chips_n, len(i), t_s)
@@ -245,6 +246,7 @@ class Session:
     skins : folder of saved calibrations
     model_name : name of the model's file; empty for the model that is shipped with the package
     emulated : the emulated board at the port; None for a real board, whose true contacts are unknown
+    wire : format of the board, if it is none of those that are detected
     """
 
     def __init__(
@@ -258,8 +260,9 @@ class Session:
         skins: SkinFolder | None = None,
         model_name: str = "",
         emulated: EmulatedBoard | None = None,
+        wire: CustomWire | None = None,
     ) -> None:
-        self.skin, self.source = LiveSkin(port, models, fault_policy=fault_policy), source
+        self.skin, self.source = LiveSkin(port, models, fault_policy=fault_policy, wire=wire), source
         self._models, self._model_name = models, model_name
         self._alone, self._emulated, self._skins = alone, emulated, skins or SkinFolder()
         self.traces: Traces | None = None
@@ -501,6 +504,8 @@ class Session:
                 self.skin.zero()
             elif button == "undo":
                 self._changes.append(UniversalEstimator.undo)
+            elif button == "refine":
+                self._changes.append(UniversalEstimator.refine)
             elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
                 requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
                 self._presses = requested if self._presses is None else None
@@ -605,6 +610,7 @@ def open_sessions(
     skins: SkinFolder | None = None,
     model_name: str = "",
     emulated: EmulatedBoard | None = None,
+    wire: CustomWire | None = None,
 ) -> list[Session]:
     """Create one session per port. See `Session` for the arguments.
 
@@ -615,7 +621,8 @@ def open_sessions(
     skins, alone = skins or SkinFolder(), len(ports) == 1
     return [
         Session(
-            port, models, source, fault_policy, alone=alone, skins=skins, model_name=model_name, emulated=emulated
+            port, models, source, fault_policy, alone=alone, skins=skins, model_name=model_name, emulated=emulated,
+            wire=wire,
         )
         for port in ports
     ]  # fmt: skip

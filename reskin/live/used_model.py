@@ -56,7 +56,8 @@ class Measured(Strict):
 def describe(
     estimator: NetworkEstimator | UniversalEstimator | None, models: Models, model_name: str
 ) -> dict[str, str | bool]:
-    """Return the texts `model`, `learnt`, `expected` and `least_force` of the page, and whether `undo` is possible.
+    """Return the texts `model`, `learnt`, `expected` and `least_force` of the page, and whether `undo` and `refine`
+    are possible.
 
     `models` are the models that the user has chosen. `model_name` contains the names of their files. It is empty for
     the universal model that is shipped with the package.
@@ -66,16 +67,17 @@ def describe(
         name = f"universal model, {f'file {model_name}' if model_name else 'shipped with reskin'}"
         return {
             "model": name + (f", with the saved skin {state.origin_name}" if state.origin_name else ""),
-            "learnt": _learnt(state), "undoable": estimator.undoable,
+            "learnt": _learnt(state), "undoable": estimator.undoable, "refinable": model.refinable,
             "expected": _expected_of_universal(model), "least_force": _least_force_of_universal(model),
         }  # fmt: skip
     if isinstance(estimator, NetworkEstimator) and not isinstance(models, Universal):
         kind = "trained network" if len(models) == 1 else f"mean of {len(models)} trained networks"
         return {
-            "model": f"{kind}, file {model_name}" if model_name else kind, "learnt": "", "undoable": False,
+            "model": f"{kind}, file {model_name}" if model_name else kind, "learnt": "",
+            "undoable": False, "refinable": False,
             "expected": _expected_of_networks(models), "least_force": NOT_MEASURED,
         }  # fmt: skip
-    return {"model": "", "learnt": "", "undoable": False, "expected": "", "least_force": ""}
+    return {"model": "", "learnt": "", "undoable": False, "refinable": False, "expected": "", "least_force": ""}
 
 
 def _learnt(state: LearningState) -> str:
@@ -85,15 +87,16 @@ def _learnt(state: LearningState) -> str:
         "at crosses": len(state.guided.db_uT),
         "with a label that you entered": len(state.typed.db_uT),
     }
-    return ", ".join(f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count)
+    learnt = ", ".join(f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count)
+    return f"{learnt}; network refined" if state.refined else learnt
 
 
 def _expected_of_universal(model: Universal) -> str:
     measured = _measured_of(model)
     if measured is None:
         return f"{NOT_MEASURED} for this model"
-    if model.slide is not None:
-        return f"{NOT_MEASURED} after a calibration on an earlier day"
+    if model.skin.data.refined:
+        return f"{NOT_MEASURED} for a refined network"
     own_n = model.presses_n - model.labels_n, model.labels_n
     fitting = [each for each in measured.places if each.presses_n <= own_n[0] and each.labels_n <= own_n[1]]
     if not fitting:
@@ -107,7 +110,7 @@ def _expected_of_universal(model: Universal) -> str:
 
 
 def _least_force_of_universal(model: Universal) -> str:
-    measured, least_N = _measured_of(model), float(model.tables.force_N[0])
+    measured, least_N = _measured_of(model), model.layout.force_N[0]
     trained = f"trained with simulated forces from {least_N:.2g} N"
     if measured is None:
         return f"{NOT_MEASURED}; {trained}"

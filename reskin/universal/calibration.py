@@ -1,34 +1,28 @@
-"""Data to which the universal model is calibrated, and the likelihood powers of a calibrated model.
+"""Data to which the universal model is calibrated: their checks, and the file of a saved skin.
 
 The data of one skin are its no-load field, presses at unknown places, and labelled presses (presses with known places
-and forces). This module checks these data, writes them to a file, and reads them.
-
-A likelihood power is the exponent to which a likelihood is raised. A power below 1 increases the standard deviations of
-estimates. Cross-validation over the labelled presses shows whether the standard deviations match the errors.
+and, if they were measured, forces).
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 
 from reskin import io
 from reskin.errors import SchemaError
-from reskin.universal.map import Estimate, NOISE_uT
-from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # values in one reading of the paper's board, which has five chips with three axes each
 # Largest accepted field, which is 20 times the range of a chip. The square of this value can be represented in single
 # precision.
 FIELD_MAX_uT = 1e6
+NOISE_uT = 5.0  # a field change that is smaller at every chip is noise
 RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
-# Largest number of labels. There is a limit because the memory grows with the square of the number of labels, and the
-# computing time grows even faster.
-LABELS_MAX_N = 2000
+# Largest number of labels: the time to calibrate the forces grows with the third power of it.
+LABELS_MAX_N = 1000
+UNLABELLED_MAX_N = 65  # a calibration uses the latest presses at unknown places, at most this number
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
@@ -83,22 +77,22 @@ def check_labels(
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, from {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
-    _need("labels", "forces", "above 0 N", forces_N, forces_N > 0)
-    _need("labels", "forces", "finite", forces_N, np.isfinite(forces_N))
+    _need("labels", "forces", "above 0 N", forces_N, ~(forces_N <= 0))
+    _need("labels", "forces", "finite", forces_N, ~np.isinf(forces_N))
     return places_mm, forces_N
 
 
 def check_number(labels_n: int) -> None:
     """Raise SchemaError if there are more than LABELS_MAX_N labels."""
     if labels_n > LABELS_MAX_N:
-        rule = f"At most {LABELS_MAX_N} labels can be used, including the labels of earlier days"
+        rule = f"At most {LABELS_MAX_N} labels can be used, including those that are kept"
         raise SchemaError(f"labels: {labels_n} labels are too many. {rule}. Select some of them.")
 
 
-def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
+def check_range(force_N: Float[np.ndarray, " m"], range_N: tuple[float, float]) -> None:
     """Raise SchemaError if the force of a label is outside the model's range by a factor of `RANGE_FACTOR` or more."""
-    least_N, most_N = float(range_N.min()), float(range_N.max())
-    inside = (force_N > least_N / RANGE_FACTOR) & (force_N < RANGE_FACTOR * most_N)
+    least_N, most_N = range_N
+    inside = ~((force_N <= least_N / RANGE_FACTOR) | (force_N >= RANGE_FACTOR * most_N))
     if not inside.all():
         got = f"{force_N[~inside][0]:.6g} N"
         rule = f"about {least_N:.3g} to {most_N:.3g} N, which is the force range of the model"
@@ -106,12 +100,10 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
         raise SchemaError("labels", "forces", rule, got, remedy)
 
 
-# Users may pass field changes where readings are needed, or readings where field changes are needed. Such mistakes are
-# detected by comparing two distances: readings of presses are near the no-load reading, but field changes are near 0.
-# Each kind of value therefore has a point to which it should be near (the no-load reading or 0), and a point from which
-# it should be far. Values are refused if their distance to the second point, divided by their distance to the first
-# point, is below this limit. On the boards of scene lab, the median of this ratio is 0.15 to 0.22 for values of the
-# wrong kind, and 4 or more for values of the right kind.
+# Users may pass field changes where readings are needed. Readings of presses are near the no-load reading, but field
+# changes are near 0. Values are refused if their distance to 0, divided by their distance to the no-load reading, is
+# below this limit. On the boards of scene lab, the median of this ratio is 0.15 to 0.22 for field changes, and 4 or
+# more for readings.
 NEAR_MAX = 0.5
 
 
@@ -140,18 +132,6 @@ def check_is_reading(where: str, b_uT: Float[np.ndarray, "m ch"], noload_uT: Flo
         raise SchemaError(f"{problem}. Pass the readings themselves: do not subtract the no-load reading from them.")
 
 
-def check_is_change(where: str, db_uT: Float[np.ndarray, "m ch"], noload_uT: Float[np.ndarray, " ch"]) -> None:
-    """Raise SchemaError if `db_uT` contains readings of presses instead of field changes.
-
-    `where` is the name of the calling function, for the error message.
-    """
-    if _median_norm(db_uT - noload_uT) < NEAR_MAX * _median_norm(db_uT):
-        problem = (
-            f"{where}: the values seem to be readings, because they are nearer to the no-load reading than to 0 uT"
-        )
-        raise SchemaError(f"{problem}. Pass field changes: subtract the no-load reading from the readings.")
-
-
 def _median_norm(values_uT: Float[np.ndarray, "m ch"]) -> float:
     return float(np.median(np.linalg.norm(values_uT, axis=1))) if len(values_uT) else 0.0
 
@@ -162,329 +142,147 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit the press or reading with this value.")
 
 
-# Formats of calibration files, newest first. Files in older formats can still be read, but contain less: format 1 does
-# not state which forces are known. Formats 1 and 2 do not state how the skin is mounted; the skin is then assumed not
-# to be turned. Formats 1 to 3 contain the data of only one day.
-FORMAT, FORMAT_3, FORMAT_2, FORMAT_1 = "reskin-skin-4", "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
-# Prefix of the array names of an earlier day in a file. The placeholder is the number of the day; the oldest day has
-# the number 0.
-EARLIER_DAY = "earlier_{}_"
-DAYS_MAX_N = 5  # largest number of days in a calibration file, including the current day
-ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
-UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
-# Larger files are refused. The largest calibration (five full days with all labels, on a board with 64 chips) has a
-# size of 4.1 MB.
-FILE_BYTES_MAX_N = 2**23
-REMEDY = "Use a calibration that `Universal.save` or the page of `reskin live` has saved."
-# A file states the name of its board under the first key. If it does not, it is for the board of the second name.
-BOARD, PAPER_BOARD = "board", "reskin"
+FORMAT = "reskin-skin-5"
+OLDER = ("reskin-skin-1", "reskin-skin-2", "reskin-skin-3", "reskin-skin-4")  # formats of the model before this one
+ARRAYS = ("rest_uT", "presses_uT", "labelled_mm", "labelled_N", "labelled_uT")
+REFINED = "refined."  # prefix of the names of the weights of a network that was refined on the skin
+FILE_BYTES_MAX_N = 2**24  # larger files are refused; with LABELS_MAX_N labels on 64 chips, a file has 5 MB
+REMEDY = "Use a skin that `Universal.save` or the page of `reskin live` has saved."
+
+
+def no_presses(channels_n: int = CHANNELS_N) -> Float[np.ndarray, "0 ch"]:
+    """Return no presses, as an array."""
+    return np.zeros((0, channels_n))
 
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses at known places, with their forces and field changes. Places are relative to the board's centre.
+    """Presses at known places, with their forces (NaN if unknown) and field changes.
 
-    A force is either a known true value or, if the user stated only the place, an estimate. `force_known` is True for
-    the forces that are true values. By default, all forces are.
+    Places are relative to the board's centre.
     """
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
-    force_known: Bool[np.ndarray, " m"] | None = None
 
     def __len__(self) -> int:
         return len(self.force_N)
 
-    @property
-    def known(self) -> Bool[np.ndarray, " m"]:
-        """Whether each force is a true value (True) or an estimate (False)."""
-        return np.ones(len(self), bool) if self.force_known is None else self.force_known
-
-    def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
+    def __getitem__(self, which: slice | np.ndarray) -> "LabelledPresses":
         """Return some of the presses, selected by a slice or by their indices."""
-        known = None if self.force_known is None else self.force_known[which]
-        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which], known)
+        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which])
 
-
-def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses:
-    """Append the labelled presses `other` to `one`."""
-    return LabelledPresses(
-        np.concatenate([one.place_mm, other.place_mm]), np.concatenate([one.force_N, other.force_N]),
-        np.concatenate([one.db_uT, other.db_uT]), np.concatenate([one.known, other.known]),
-    )  # fmt: skip
-
-
-def no_presses(channels_n: int = CHANNELS_N) -> Float[np.ndarray, "0 ch"]:
-    return np.zeros((0, channels_n))
-
-
-def no_labels(channels_n: int = CHANNELS_N) -> LabelledPresses:
-    return LabelledPresses(np.zeros((0, 2)), np.zeros(0), no_presses(channels_n))
+    def joined_to(self, other: "LabelledPresses") -> "LabelledPresses":
+        """Return these presses after `other`."""
+        return LabelledPresses(
+            np.concatenate([other.place_mm, self.place_mm]), np.concatenate([other.force_N, self.force_N]),
+            np.concatenate([other.db_uT, self.db_uT]),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class CalibrationData:
-    """All calibration data of one skin, in the board's frame and axes.
-
-    By default, there are no presses, and the board is the paper's board.
+class SkinData:
+    """All that is known of one skin, along the axes of the board and relative to its centre.
 
     Parameters
     ----------
     rest_uT : no-load field
-    presses_uT : field changes of at most `FULL_SET_N` presses at unknown places
-    even_uT : field changes of presses that are evenly spread over the skin
-    area_uT : field changes of presses at random places all over the area of presses
+    presses_uT : field changes of at most `UNLABELLED_MAX_N` presses at unknown places
     labels : presses at known places
-    turned : whether the skin is turned by a quarter. If it is, all fields in this object have the opposite sign of the
-        fields on the board, as if the skin were not turned.
-    earlier : the data of earlier days in order of time. Each element contains the presses of one day only.
+    refined : weights of the network after it was refined on this skin; empty if it was not
     """
 
     rest_uT: Float[np.ndarray, " ch"]
-    presses_uT: Float[np.ndarray, "c ch"] = field(default_factory=no_presses)
-    even_uT: Float[np.ndarray, "e ch"] = field(default_factory=no_presses)
-    area_uT: Float[np.ndarray, "a ch"] = field(default_factory=no_presses)
-    labels: LabelledPresses = field(default_factory=no_labels)
-    turned: bool = False
-    earlier: "tuple[CalibrationData, ...]" = ()
+    presses_uT: Float[np.ndarray, "u ch"]
+    labels: LabelledPresses
+    refined: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def unrefined(self) -> "SkinData":
+        """Return the same data without a refined network."""
+        return replace(self, refined={})
 
     @classmethod
-    def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "CalibrationData":
-        """Return the data of a skin of which only the no-load field is known, on a board with any number of chips."""
-        empty = no_presses(len(rest_uT))
-        return cls(rest_uT, empty, empty, empty, no_labels(len(rest_uT)))
+    def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "SkinData":
+        """Return the data of a skin of which only the no-load field is known."""
+        none = no_presses(len(rest_uT))
+        return cls(rest_uT, none, LabelledPresses(np.zeros((0, 2)), np.zeros(0), none))
 
-    @property
-    def presses_n(self) -> int:
-        """Number of presses on all days, including labelled presses."""
-        return len(self.presses_uT) + len(self.labels) + sum(day.presses_n for day in self.earlier)
-
-    @property
-    def labels_n(self) -> int:
-        """Number of labelled presses on all days."""
-        return len(self.labels) + sum(day.labels_n for day in self.earlier)
-
-    def next_day(self) -> "CalibrationData":
-        """Return the data with which a new day begins.
-
-        The new day has the same no-load field and no presses. The current day becomes an earlier day, if it has
-        presses. At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the oldest day is dropped.
-        """
-        pressed = len(self.presses_uT) + len(self.labels) > 0
-        earlier = (*self.earlier, replace(self, earlier=())) if pressed else self.earlier
-        data = CalibrationData.at_rest(self.rest_uT)
-        return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
-
-    def joined_to(self, last: "CalibrationData") -> "CalibrationData":
-        """Join these data and the data `last` of the last day as if all were of one day.
-
-        This is used for a skin that slid in the same way on both days. The presses of the last day come first in the
-        result. The `area_uT` of the last day is kept only if the current day has no presses at unknown places, because
-        all presses together must be at random places. `Universal.see` follows the same rule within a day.
-        """
-        presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
-        even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
-        area_uT = self.area_uT if len(self.presses_uT) else last.area_uT
-        labels = join_labels(last.labels, self.labels)
-        return replace(self, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT, labels=labels, earlier=())
+    def and_seen(self, db_uT: Float[np.ndarray, "n ch"]) -> "SkinData":
+        """Add presses at unknown places; the oldest ones are dropped if there are too many."""
+        return replace(self, presses_uT=np.concatenate([self.presses_uT, db_uT])[-UNLABELLED_MAX_N:])
 
 
-def write_calibration(data: CalibrationData, file: Path, board: str) -> None:
-    """Write calibration data and the name of the model's board to a safetensors file, without the model itself."""
-    tensors = _arrays(data)
-    for i, day in enumerate(data.earlier):
-        tensors |= {EARLIER_DAY.format(i) + name: values for name, values in _arrays(day).items()}
-    about = {"format": FORMAT, "turned": str(data.turned).lower(), BOARD: board}
-    io.write_tensors(file, tensors, about)
+def write_skin(data: SkinData, file: Path, board: str) -> None:
+    """Write the data of a skin and the name of the model's board to a safetensors file."""
+    labels = data.labels
+    values = (data.rest_uT, data.presses_uT, labels.place_mm, labels.force_N, labels.db_uT)
+    refined = {REFINED + name: value for name, value in data.refined.items()}
+    io.write_tensors(file, dict(zip(ARRAYS, values, strict=True)) | refined, {"format": FORMAT, "board": board})
 
 
-def _arrays(day: CalibrationData) -> dict[str, np.ndarray]:
-    labels = day.labels
-    labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
-    values = (day.presses_uT, day.even_uT, day.area_uT, *labelled)
-    return {"rest_uT": day.rest_uT, **dict(zip(ARRAYS, values, strict=True))}
+def is_skin(file: Path) -> bool:
+    """Return whether a file is a saved skin, of this or an older format.
 
-
-def is_calibration(file: Path) -> bool:
-    """Return whether a file is a calibration that `write_calibration` wrote.
-
-    A file that is too large to be a calibration is not read. Raises SchemaError if a smaller file is damaged.
+    A file that is too large to be one is not read. Raises SchemaError if a smaller file is damaged.
     """
-    formats = FORMAT, FORMAT_3, FORMAT_2, FORMAT_1
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in formats
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, *OLDER)
 
 
-def read_calibration(
-    file: Path, reach_mm: Float[np.ndarray, "2 2"], channels_n: int = CHANNELS_N, board: str = PAPER_BOARD
-) -> CalibrationData:
-    """Read calibration data from a file that `write_calibration` wrote.
+def read_skin_file(
+    file: Path, reach_mm: Float[np.ndarray, "2 2"], shapes: Mapping[str, tuple[int, ...]], board: str
+) -> SkinData:
+    """Read the data of a skin from a file that `write_skin` wrote.
 
-    `reach_mm` contains the edges of the skin relative to the board's centre: the smallest x and y in the first row, the
-    largest x and y in the second row. Raises SchemaError if the file is not a calibration, if the board in the file is
-    not called `board`, or if a labelled place is outside `reach_mm`.
+    Parameters
+    ----------
+    file : the file
+    reach_mm : edges of the skin relative to the board's centre: smallest x and y, then largest x and y
+    shapes : shapes of the weights of the model's network
+    board : name of the model's board
+
+    Raises
+    ------
+    SchemaError : the file is not a saved skin, is of another board or of an older version, or a value is invalid
     """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
-        raise SchemaError(
-            f"{file}: the file has {bytes_n:,} bytes, but a saved calibration has at most {FILE_BYTES_MAX_N:,}. "
-            f"{REMEDY}"
-        )
+        problem = f"{file}: the file has {bytes_n:,} bytes, but a saved skin has at most {FILE_BYTES_MAX_N:,}"
+        raise SchemaError(f"{problem}. {REMEDY}")
     tensors, metadata = io.read_tensors(file, digest_needed=True)
-    if "rest_slope_uT" in tensors:
-        remedy = "In Python, pass it to load_universal as the argument `file`."
-        raise SchemaError(f"{file}: this file is a universal model, not a saved calibration. {remedy}")
-    if (own := metadata.get(BOARD, PAPER_BOARD)) != board:
-        remedy = f"Use this calibration with the model that was made for board {own}."
-        raise SchemaError(file, "the calibrated board", f"{board}, the board of the model", own, remedy)
-    if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
-        added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses(channels_n)}
-        tensors = {**tensors, **added}
-    elif metadata.get("format") not in (FORMAT, FORMAT_3, FORMAT_2):
-        raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
-    turned = metadata.get("turned", "false")
-    if turned not in ("true", "false"):
-        raise SchemaError(file, "turned", "true or false", turned, REMEDY)
-    earlier: list[CalibrationData] = []
-    while arrays := _take_day(tensors, EARLIER_DAY.format(len(earlier))):
-        earlier.append(replace(_read_day(file, arrays, reach_mm, channels_n), turned=turned == "true"))
-    data = replace(_read_day(file, tensors, reach_mm, channels_n), turned=turned == "true", earlier=tuple(earlier))
-    if len(earlier) >= DAYS_MAX_N or data.labels_n > LABELS_MAX_N:
-        rule, got = f"at most {DAYS_MAX_N} days with {LABELS_MAX_N} labels", f"{len(earlier) + 1} with {data.labels_n}"
-        raise SchemaError(file, "days", rule, got, REMEDY)
-    return data
-
-
-def _take_day(tensors: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Remove the arrays whose names begin with a prefix from `tensors`.
-
-    Returns these arrays by name, without the prefix.
-    """
-    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
-
-
-def _read_day(
-    file: Path, tensors: Mapping[str, np.ndarray], reach_mm: Float[np.ndarray, "2 2"], channels_n: int
-) -> CalibrationData:
-    """Check the arrays of one day that were read from a file, and return the data of this day."""
+    form, channels_n = metadata.get("format"), shapes["usual_rest"][0]
+    if form in OLDER:
+        raise SchemaError(
+            f"{file}: this skin was saved by an earlier version, whose model worked in another way. Calibrate the skin "
+            "again; a dozen presses suffice."
+        )
+    if form != FORMAT:
+        raise SchemaError(file, "format", FORMAT, form, REMEDY)
+    if (own := metadata.get("board")) != board:
+        remedy = f"Use this skin with the model that was made for board {own}."
+        raise SchemaError(file, "the board", f"{board}, the board of the model", own, remedy)
+    refined = {name.removeprefix(REFINED): tensors.pop(name) for name in list(tensors) if name.startswith(REFINED)}
     got = {name: values.shape for name, values in sorted(tensors.items())}
-    counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
-    shapes: dict[str, tuple[int, ...]] = {"labelled_mm": (2,), "labelled_N": (), "force_known": ()}
-    expected = {"rest_uT": (channels_n,)} | {
-        name: (counts_n.get(name, 0), *shapes.get(name, (channels_n,))) for name in ARRAYS
-    }
-    if got != expected or max(counts_n[name] for name in UNLABELLED) > FULL_SET_N:
-        rule = f"rest_uT, {', '.join(ARRAYS)} of {channels_n} channels and at most {FULL_SET_N} unlabelled presses"
+    presses_n, labels_n = (got.get(name, (0,))[0] for name in ("presses_uT", "labelled_uT"))
+    fields = {"rest_uT": (channels_n,), "presses_uT": (presses_n, channels_n), "labelled_uT": (labels_n, channels_n)}
+    expected = fields | {"labelled_mm": (labels_n, 2), "labelled_N": (labels_n,)}
+    if got != expected or presses_n > UNLABELLED_MAX_N:
+        rule = f"{', '.join(ARRAYS)} of {channels_n} channels and at most {UNLABELLED_MAX_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
-    fields_uT = {
-        name: check_readings(values, channels_n)
-        for name, values in tensors.items()
-        if expected[name][1:] == (channels_n,)
-    }
-    labels_n = len(fields_uT["labelled_uT"])
+    check_weights(file, refined, shapes if refined else {})
+    rest_uT, presses_uT, labelled_uT = (check_readings(tensors[name], channels_n) for name in fields)
     place_mm, force_N = check_labels(
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
     )
-    if counts_n["force_known"] != labels_n:
-        known = f"{counts_n['force_known']} values for {labels_n} labels"
-        raise SchemaError(file, "force_known", "one value per label", known, REMEDY)
-    rest_uT = check_readings(tensors["rest_uT"], channels_n)[0]
-    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
-    presses_uT, even_uT, area_uT = (fields_uT[name] for name in UNLABELLED)
-    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels)
+    return SkinData(rest_uT[0], presses_uT, LabelledPresses(place_mm, force_N, labelled_uT), refined)
 
 
-FOLDS_N = 5  # folds of the cross-validation over labels
-# The variance inflation is estimated with a prior, according to which it is 1. The prior has the same weight as this
-# number of labelled coordinates, where each label has two coordinates (docs/learning.md).
-PRIOR_N = 40.0
-NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| for a variable z with a standard normal distribution
-
-# Labelled presses of one fold that were held out: their estimates with each likelihood power, and their true places.
-HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]
-
-
-@dataclass(frozen=True)
-class LikelihoodPowers:
-    """Tables of likelihood powers, which were determined on simulated skins for a misfit of 1.
-
-    `anywhere` contains powers by number of presses at unknown places, and for each of these numbers by number of
-    labels. `even` contains powers by number of labels, for presses that are evenly spread over the skin. Between
-    tabulated numbers of labels, the logarithm of the power is interpolated linearly. A number of presses that is not
-    tabulated is rounded down to the next tabulated number.
-    """
-
-    anywhere: Mapping[int, Mapping[int, float]]
-    even: Mapping[int, float]
-
-    def power_for(self, presses_n: int, labels_n: int, *, even: bool) -> float:
-        """Return the power for these numbers of presses and labels."""
-        powers = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= presses_n)]
-        tabulated_n = sorted(powers)
-        return float(np.exp(np.interp(labels_n, tabulated_n, np.log([powers[n] for n in tabulated_n]))))
-
-    def are_enough(self, presses_n: int) -> bool:
-        """Return whether there are so many presses that their misfit can be used."""
-        return any(0 < n <= presses_n for n in self.anywhere)
-
-    def to_card(self) -> dict[str, dict[str, Any]]:
-        """Convert the powers to a JSON object for the model card."""
-        anywhere = {str(presses_n): _named(powers) for presses_n, powers in self.anywhere.items()}
-        return {"anywhere": anywhere, "even": _named(self.even)}
-
-    @classmethod
-    def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
-        """Convert the JSON object that `to_card` returns to powers."""
-        anywhere = {int(presses_n): _numbered(powers) for presses_n, powers in card["anywhere"].items()}
-        return cls(anywhere, _numbered(card["even"]))
-
-
-def _named(powers: Mapping[int, float]) -> dict[str, float]:
-    return {str(n): power for n, power in powers.items()}
-
-
-def _numbered(powers: Mapping[str, float]) -> dict[int, float]:
-    return {int(n): power for n, power in powers.items()}
-
-
-def lower_by_misfit(power: float, misfit: float) -> float:
-    """Divide a likelihood power by the misfit of unlabelled presses, and limit the result to 1."""
-    return min(1.0, power / misfit)
-
-
-def lower_by_residuals(power: float, inflation: float) -> float:
-    """Divide a likelihood power by the variance inflation of held-out labels, and limit the result to 1."""
-    return min(1.0, power / inflation)
-
-
-def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
-    """Split labels into folds for cross-validation.
-
-    Label i is in fold i modulo `FOLDS_N`. Returns, for each fold, the indices of the labels outside the fold and the
-    indices of the labels in the fold.
-    """
-    fold = np.arange(labels_n) % FOLDS_N
-    return [(np.flatnonzero(fold != i), np.flatnonzero(fold == i)) for i in range(min(FOLDS_N, labels_n))]
-
-
-def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
-    """Return the variance inflation for each of `powers_n` likelihood powers, from labels that were held out.
-
-    The variance inflation is the factor by which the squared errors exceed the variances that were estimated with the
-    likelihood power.
-    """
-    inflations = []
-    for i in range(powers_n):
-        errors_sd = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
-        inflations.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *errors_sd])))
-    return inflations
-
-
-def variance_inflation(errors_sd: Float[np.ndarray, "m 2"]) -> float:
-    """Return the variance inflation for errors that have been divided by their estimated standard deviations.
-
-    If the standard deviations are right, these ratios have a standard normal distribution. The inflation is therefore
-    the square of the mean absolute ratio, divided by the mean absolute value of a standard normal variable. Absolute
-    values are used because they are less sensitive to outliers than squares. A prior with the weight `PRIOR_N` moves
-    the inflation towards 1.
-    """
-    return ((PRIOR_N + float(errors_sd.sum()) / NORMAL_MEAN) / (PRIOR_N + errors_sd.size)) ** 2
+def check_weights(file: Path, weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise SchemaError unless arrays are finite float32 numbers of the given shapes."""
+    got = {name: tuple(value.shape) for name, value in weights.items()}
+    if got != dict(shapes):
+        wrong = next(name for name in [*shapes, *got] if got.get(name) != shapes.get(name))
+        rule, remedy = f"of shape {shapes.get(wrong)}", "The file is damaged, or is of another version: make it again."
+        raise SchemaError(file, f"array {wrong}", rule, got.get(wrong, "none"), remedy)
+    for name, value in weights.items():
+        if value.dtype != np.float32 or not np.isfinite(value).all():
+            raise SchemaError(file, f"array {name}", "finite float32 numbers", value.dtype, "The file is damaged.")

@@ -1,147 +1,108 @@
-"""Calibration of the forces of a skin: a straight line from estimated to true forces, on logarithmic scales.
+"""The force of a press in newtons, from the estimate of the network and the known forces of labelled presses.
 
-The field change of a press grows slowly with its force F, about as F^0.2 to F^0.3 on recorded boards. Therefore, if
-the simulated field change (`reskin.universal.law`) has a small relative error, the relative error of the estimated
-force is several times as large. The estimated forces of one skin are all wrong by a similar factor, which changes
-slowly with force. The line corrects this factor. It is fitted to presses with known forces.
+The network estimates logarithms of forces. A skin may be softer than usual, and its force may grow in another way than
+that of simulated skins. `ForceHead` therefore corrects the estimates with a Gaussian process in newtons, which is
+fitted to the known forces of a skin.
 """
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
 
-LOG_CENTRE_N = math.log(2.0)  # logarithm of the force at which the intercept of the line is defined
-SCATTER_LABELS_N = 20  # the prior of the scatter about the line has the same weight as this number of labels
-NORMAL_90 = 1.645  # half width of a 90 % interval, in standard deviations
+from reskin.universal.network import LENGTH_MIN_uT
+
+# The Gaussian process is the error of the network's estimates. It is a sum of three parts with these standard
+# deviations: an unknown fraction of the estimate, a smooth function of the field change, and noise. All but the first
+# are relative to the spread of the known forces. They were chosen on simulated skins whose law errs as recorded ones.
+SCALE_SD, OF_FIELD_SD, NOISE_SD = 0.4, 0.4, 0.7
+# Length scale of the smooth function, and weights of the direction and of log |dB| in the distance of field changes.
+FIELD_LENGTH, DIRECTION_WEIGHT, LOG_WEIGHT = 2.0, 3.0, 2.0
+# Forces are limited to this range, relative to the smallest and the largest known force, if there are at least LIMIT_N
+# known forces and they span at least the factor SPAN_MIN: beyond it, nothing is known of this skin.
+RANGE, LIMIT_N, SPAN_MIN = (0.9, 1.1), 8, 3.0
+LEAST_N, LOG_MAX_N = 0.01, float(np.log(40.0))  # smaller forces are not estimated; larger estimates count as 40 N
+FLOOR = 0.3  # errors are assumed to grow with force, from this fraction of the mean known force on
+PRIOR_N, PRIOR_SPREAD = 3, 0.7  # before any force is known, the spread of forces is this fraction of their mean
+QUANTILE, NORMAL_90 = 0.9, 1.645  # 90 % of a normal distribution are within 1.645 standard deviations
 
 
-class LinePrior(NamedTuple):
-    """Prior of the line for one estimator.
-
-    `mean` and `sd` are the means and standard deviations of the intercept and the slope. `scatter_sd` is the standard
-    deviation of log forces about the line.
-    """
-
-    mean: tuple[float, float]
-    sd: tuple[float, float]
-    scatter_sd: float
-
-
-# Two estimators of the log force, each with the prior of its line: "combined" uses map and networks, "map" uses the map
-# alone. Lines were fitted to simulated skins with errors of the law as large as in training, and to skins with errors
-# twice as large. They have the following means and standard deviations, with those for doubled errors in brackets:
-# "combined": intercept -0.1 +- 0.35 (-0.7 +- 0.6), slope 1.0 +- 0.1 (1.0 +- 0.15), scatter 0.36 (0.55).
-# "map": intercept -0.3 +- 0.5 (-1.4 +- 1.1), slope 1.15 +- 0.15 (1.5 +- 0.5).
-# The prior of "map" is between the two cases. The prior of "combined" has a mean intercept of 0 and a mean slope of 1,
-# so that forces are not changed as long as no force is known.
-PRIORS = {
-    "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
-    "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
-}
-ESTIMATORS = tuple(PRIORS)
-# With `FEW_N` or more known forces, the estimator "map" is used, unless the labels clearly favour another estimator.
-# With fewer known forces, "combined" is used, because it is more accurate on simulated skins with one known force.
-FEW_N = 5
-FEW_ESTIMATOR, DEFAULT = "combined", "map"
-# Another estimator than the default is selected only if the log likelihood of the labels is larger by more than this
-# assumed value.
-MARGIN = 3.0
+def conformal(scores: Float[np.ndarray, " n"]) -> float:
+    """Return the factor that 90 % of new scores do not exceed, from held-out scores (split conformal prediction)."""
+    rank = min(int(np.ceil((len(scores) + 1) * QUANTILE)), len(scores))
+    return float(np.sort(scores)[rank - 1])
 
 
 @dataclass(frozen=True)
-class ForceLine:
-    """The line that converts the estimated log forces of one skin to true log forces, and its uncertainty.
-
-    With c = `LOG_CENTRE_N`, the line is
-
-        true log force - c = intercept + slope * (estimated log force - c).
+class ForceHead:
+    """The correction of forces, fitted to the known forces of one skin.
 
     Parameters
     ----------
-    estimator : the estimator whose log forces the line converts, one of `ESTIMATORS`
-    mean, cov : mean and covariance of intercept and slope, which have a normal distribution
-    scatter_var : variance of the true log force of a single press about the line
+    estimated_N : forces of the labelled presses, estimated without knowing their labels
+    features : features of their field changes (see `features_of`)
+    weights : weights of the labelled presses in the correction of an estimate, in N
+    mean_N, spread_N : mean and spread of the known forces
+    limits_N : range of the forces that the head returns
+    error : 90 % of held-out errors are at most this factor times the force (or FLOOR times `mean_N`, if larger)
     """
 
-    estimator: str
-    mean: Float[np.ndarray, "2"]
-    cov: Float[np.ndarray, "2 2"]
-    scatter_var: float
+    estimated_N: Float[np.ndarray, " m"]
+    features: Float[np.ndarray, "m k"]
+    weights: Float[np.ndarray, " m"]
+    mean_N: float
+    spread_N: float
+    limits_N: tuple[float, float]
+    error: float
 
-    def apply(self, log_N: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Convert estimated log forces to calibrated log forces. Returns these and their standard deviations."""
-        # Written without matrix products, because this is faster for a single reading.
-        (intercept, slope), off = self.mean, log_N - LOG_CENTRE_N
-        var = self.cov[0, 0] + self.scatter_var + off * (2 * self.cov[0, 1] + off * self.cov[1, 1])
-        return LOG_CENTRE_N + intercept + slope * off, np.sqrt(var)
-
-    def condition(self, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> "ForceLine":
-        """Condition the line on presses with known forces.
+    @classmethod
+    def fit(
+        cls, log_N: Float[np.ndarray, " m"], db_uT: Float[np.ndarray, "m ch"], known_N: Float[np.ndarray, " m"]
+    ) -> "ForceHead":
+        """Fit a head to one or more known forces.
 
         Parameters
         ----------
-        log_N : estimated log forces of the presses
-        true_log_N : true log forces of the presses
+        log_N : the network's estimates of the logarithms of these forces, made without knowing them
+        db_uT : field changes of these presses
+        known_N : the forces
         """
-        row, deviation = _row(log_N), true_log_N - LOG_CENTRE_N
-        posterior = self._update(row, deviation, self.scatter_var)
-        residual = deviation - row @ posterior.mean
-        # The sum of the squared residuals, as an expected value over the posterior distribution of the line.
-        squared = float(residual @ residual + ((row @ posterior.cov) * row).sum())
-        scatter_var = (SCATTER_LABELS_N * self.scatter_var + squared) / (SCATTER_LABELS_N + len(residual))
-        return self._update(row, deviation, scatter_var)
+        n, mean_N = len(known_N), float(known_N.mean())
+        estimated_N, features = np.exp(np.minimum(log_N, LOG_MAX_N)), features_of(db_uT)
+        squares_N2 = known_N.var() * n + PRIOR_N * (PRIOR_SPREAD * mean_N) ** 2
+        spread_N = float(np.sqrt(squares_N2 / (n + PRIOR_N)))
+        covariance = _covariance(estimated_N / spread_N, estimated_N / spread_N, features, features)
+        inverse = cho_solve(cho_factor(covariance + NOISE_SD**2 * np.eye(n)), np.eye(n))
+        weights = inverse @ (known_N - estimated_N)
+        wide = n >= LIMIT_N and known_N.max() >= SPAN_MIN * known_N.min()
+        limits_N = (RANGE[0] * float(known_N.min()), RANGE[1] * float(known_N.max())) if wide else (LEAST_N, np.inf)
+        held_out_N = np.clip(known_N - weights / np.diag(inverse), *limits_N)  # leave-one-out estimates in closed form
+        error = conformal(np.abs(held_out_N - known_N) / np.maximum(held_out_N, FLOOR * mean_N))
+        return cls(estimated_N, features, weights, mean_N, spread_N, limits_N, error)
 
-    def _update(self, row: Float[np.ndarray, "m 2"], deviation: Float[np.ndarray, " m"], var: float) -> "ForceLine":
-        prior = np.linalg.inv(self.cov)
-        cov = np.linalg.inv(prior + row.T @ row / var)
-        return ForceLine(self.estimator, cov @ (prior @ self.mean + row.T @ deviation / var), cov, var)
+    def force_N(self, log_N: Float[np.ndarray, " n"], db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
+        """Correct the network's estimates."""
+        estimated_N = np.exp(np.minimum(log_N, LOG_MAX_N))
+        scaled = estimated_N / self.spread_N, self.estimated_N / self.spread_N
+        correction_N = _covariance(*scaled, features_of(db_uT), self.features) @ self.weights
+        return np.clip(estimated_N + correction_N, *self.limits_N)
 
-
-def prior_line(estimator: str = FEW_ESTIMATOR) -> ForceLine:
-    """Return the line of an estimator before any force is known."""
-    prior = PRIORS[estimator]
-    return ForceLine(estimator, np.array(prior.mean), np.diag(np.square(prior.sd)), prior.scatter_sd**2)
-
-
-def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[np.ndarray, " m"]) -> ForceLine:
-    """Select the estimator, and fit its line to presses with known forces.
-
-    With fewer than `FEW_N` known forces, the estimator is `FEW_ESTIMATOR`. Otherwise, it is `DEFAULT`, unless the known
-    forces are more likely under another estimator by a factor above exp(`MARGIN`). For this comparison, each known
-    force is predicted with the line that is fitted to the other known forces.
-
-    Parameters
-    ----------
-    by_estimator : log forces of the presses, once for each of `ESTIMATORS`. The log force of a press must have been
-        estimated by a model that is not calibrated to the label of this press.
-    true_log_N : true log forces of the presses
-    """
-    log_forces, selected = dict(zip(ESTIMATORS, by_estimator, strict=True)), FEW_ESTIMATOR
-    if len(true_log_N) >= FEW_N:
-        score = {name: _held_out_likelihood(name, log_N, true_log_N) for name, log_N in log_forces.items()}
-        best = max(score, key=lambda name: score[name])
-        selected = best if score[best] > score[DEFAULT] + MARGIN else DEFAULT
-    return prior_line(selected).condition(log_forces[selected], true_log_N)
+    def sd_N(self, force_N: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the standard deviations of forces: 1.645 of them are the half width of 90 % intervals."""
+        return self.error / NORMAL_90 * np.maximum(force_N, FLOOR * self.mean_N)
 
 
-def _held_out_likelihood(estimator: str, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> float:
-    """Return the log likelihood of the known forces by leave-one-out cross-validation.
-
-    This is a sum over presses. Each term is the log likelihood of one known force under the line that is fitted to all
-    other known forces.
-    """
-    total = 0.0
-    for i in range(len(log_N)):
-        others = np.arange(len(log_N)) != i
-        line = prior_line(estimator).condition(log_N[others], true_log_N[others])
-        mean, sd = line.apply(log_N[i : i + 1])
-        total -= 0.5 * float(((true_log_N[i] - mean[0]) / sd[0]) ** 2) + math.log(sd[0])
-    return total
+def features_of(db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n k"]:
+    """Return the features of field changes whose distances the Gaussian process uses: direction, and log |dB|."""
+    length_uT = np.maximum(np.sqrt((db_uT**2).sum(axis=1, keepdims=True)), LENGTH_MIN_uT)
+    return np.concatenate([DIRECTION_WEIGHT * db_uT / length_uT, LOG_WEIGHT * np.log(length_uT)], axis=1)
 
 
-def _row(log_N: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    return np.column_stack([np.ones(len(log_N)), log_N - LOG_CENTRE_N])
+def _covariance(
+    scaled: Float[np.ndarray, " n"], others_scaled: Float[np.ndarray, " m"], features: Float[np.ndarray, "n k"],
+    others: Float[np.ndarray, "m k"],
+) -> Float[np.ndarray, "n m"]:  # fmt: skip
+    apart2 = (features**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2 * features @ others.T
+    of_field = np.exp(apart2 * (-0.5 / FIELD_LENGTH**2))
+    return SCALE_SD**2 * np.multiply.outer(scaled, others_scaled) + OF_FIELD_SD**2 * of_field

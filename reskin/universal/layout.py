@@ -22,10 +22,8 @@ from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
 from reskin.simulation.defaults import filler
 from reskin.universal.law import COARSE, RULE, START, Area, Law, Setup, to_board, to_chips, with_parameters
-from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
-from reskin.universal.population import THICKNESSES, TIPS, Forces
+from reskin.universal.population import NOMINAL, NOMINAL_SPREADS, THICKNESSES, TIPS, Forces
 
-FORCES_N = 9  # number of forces at which the map tabulates fields
 CHIPS_APART_MM = 0.5  # smallest distance between the centres of two chips, which is less than the width of a chip
 EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
 # Side of the paper's skin. For larger skins, the cells of the quadrature rule are larger in proportion.
@@ -67,7 +65,7 @@ class BoardLayout(Strict):
     # Smallest and largest force.
     force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
     # Standard deviations of some parameters of the law (`reskin.universal.law`) over skins. For all other parameters,
-    # the values in `map.NOMINAL_SPREADS` are used.
+    # the values in `population.NOMINAL_SPREADS` are used.
     spreads: dict[str, Annotated[float, Field(gt=0, le=100)]]
 
     @model_validator(mode="after")
@@ -138,12 +136,6 @@ class BoardLayout(Strict):
         The first row contains the smallest x and y, the second row the largest x and y.
         """
         return np.array([[-0.5], [0.5]]) * self.skin.size_mm
-
-    @property
-    def tabulated_N(self) -> Float[np.ndarray, " q"]:
-        """Forces at which the map tabulates fields."""
-        least, largest = np.log(self.force_N)
-        return np.exp(np.linspace(least, largest, FORCES_N))
 
     @property
     def forces(self) -> Forces:

@@ -1,28 +1,55 @@
 """Simulated skins with random properties, and presses on each skin, for the training of networks.
 
 The law (`reskin.universal.law`) is a simulation of a skin. The parameters of each skin are drawn around those of a
-central law. Each skin also has its own thickness, tip, filler and chips. The law does not describe real skins exactly,
-but its errors are not drawn here: `reskin.universal.batches` draws new errors in each training step, so that a skin
-never has the same field changes twice.
+central law. Each skin also has its own thickness, tip, filler and chips, and slides in two ways, because the slide of a
+real skin differs between days. The law does not describe real skins exactly, but its errors are not drawn here:
+`reskin.universal.episodes` draws new errors in each training step, so that a skin never has the same field changes
+twice.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from reskin.physics.deformation import RestingDipoles
-from reskin.universal.law import HALF_MM, PAPER_AREA, Area, Law, Setup, at_rest_uT, inside, simulate_uT
-from reskin.universal.map import LOGARITHMIC, perturb
+from reskin.universal.law import (
+    HALF_MM,
+    PAPER_AREA,
+    Area,
+    Law,
+    Setup,
+    at_rest_uT,
+    inside,
+    simulate_uT,
+    with_parameters,
+)
 
-PLACES_N = 65  # number of places on the paper's grid; a network is conditioned on at most this number of presses
-PRESSES_N = 2 * PLACES_N  # number of presses on each skin: the first half is for conditioning, the second for training
+PLACES_N = 65  # number of places on the paper's grid
+PRESSES_N = 2 * PLACES_N  # number of presses on each skin
 # Distance between neighbouring places of the grid, and standard deviation along each axis with which presses deviate at
 # random from the places of the grid.
 PITCH_MM, JITTER_MM = 2.0, 0.05
-ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
+ANYWHERE_SHARE = 0.5  # fraction of the second half of the presses that are anywhere on the skin, not on the grid
+
+# Central parameters of the paper's skin. The form of the law, gap, amplitude, `away_um_mm` and `lets_go_N` come from
+# the two recorded boards of scene lab. Many other pairs of gap and amplitude fit a board about equally well. The
+# modulus belongs to the stiffening of `Law`; simulated scenes have another pair (nominal.yaml: 330 kPa, no stiffening).
+# See `Law` for the meaning of each parameter.
+NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.5, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
+# Standard deviations of the parameters over skins; those of the parameters in LOGARITHMIC are of their logarithm. All
+# are assumed, and larger than the differences between the two recorded boards.
+NOMINAL_SPREADS = {
+    "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5,
+    "label_y_mm": 0.5, "modulus_MPa": 0.4, "stiffening": 0.5, "away_um_mm": 2.5, "give_x_um": 40.0, "give_y_um": 40.0,
+    "lets_go_N": 2.4, "tilt_x_deg": 0.7, "tilt_y_deg": 0.7, "label_rotation_deg": 0.5,
+}  # fmt: skip
+LOGARITHMIC = ("amplitude", "modulus_MPa")
+# Parameters of the slide, which are drawn again for the second session of a skin: equal presses two days apart have
+# cosines from 0.05 to 0.98 in the recordings of scene lab.
+SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 
 # Boards and skins differ in the parameters of the law, and also in the properties that the following constants
 # describe. The values of these constants and the spreads of the parameters are assumed. Thickness and tip radius are
@@ -50,12 +77,11 @@ class Forces:
 
     A fraction `light_share` of the presses is light: the logarithms of their forces are uniformly distributed between
     those of `light_N` and `least_N`. The logarithms of the other forces are uniformly distributed between those of
-    `least_N` and `largest_N`. If `weight_N` is given, each skin has one additional press at the centre with this force.
+    `least_N` and `largest_N`.
     """
 
     least_N: float = 0.5
     largest_N: float = 10.0
-    weight_N: float | None = None
     light_N: float = 0.05
     light_share: float = 0.0
 
@@ -68,17 +94,15 @@ class Forces:
         return np.where(rng.random(n) < self.light_share, light_N, force_N)
 
 
-DEFAULT_FORCES = Forces(light_share=0.2)
-
-
 @dataclass(frozen=True)
 class Population:
-    """Simulated skins, and the presses on each skin. Places and fields are along the axes of the board.
+    """Simulated skins, and the same presses on each skin in two sessions, in which the skin slides differently.
 
-    The first `PLACES_N` presses of each skin are on the grid, one at each place.
+    Places and fields are along the axes of the board. The first `PLACES_N` presses of each skin are on the grid, one at
+    each place.
     """
 
-    db_uT: Float32[np.ndarray, "s m ch"]
+    db_uT: Float32[np.ndarray, "s 2 m ch"]
     rest_uT: Float32[np.ndarray, "s ch"]
     place_mm: Float32[np.ndarray, "s m 2"]
     force_N: Float32[np.ndarray, "s m"]
@@ -88,13 +112,12 @@ class Population:
 
 
 def draw_population(
-    centre: Law, spreads: Mapping[str, float], setup: Setup, skins: int | slice, rng: np.random.Generator,
-    forces: Forces = DEFAULT_FORCES,
+    centre: Law, spreads: Mapping[str, float], setup: Setup, skins_n: int, rng: np.random.Generator,
+    forces: Forces,
 ) -> Population:  # fmt: skip
-    """Simulate skins with parameters around those of a central law, and 130 presses on each skin.
+    """Simulate skins with parameters around those of a central law, and 130 presses on each skin in two sessions.
 
-    The simulation takes 40 ms per skin. `skins` is the number of skins, or a slice. With a slice, only the selected
-    skins of a longer sequence of skins are simulated.
+    The simulation takes 80 ms per skin.
     """
     own_mm = setup.design.thickness_mm
     setups = {
@@ -105,12 +128,14 @@ def draw_population(
         for thickness in THICKNESSES
         for tip in TIPS
     }  # fmt: skip
-    parts, selected = [], skins if isinstance(skins, slice) else slice(skins)
+    parts = []
     # Each skin has its own generator, so that the first skins do not depend on the number of skins.
-    for skin_rng in rng.spawn(selected.stop)[selected]:
+    for skin_rng in rng.spawn(skins_n):
         law = draw_law(centre, spreads, skin_rng)
         thickness, tip = (float(skin_rng.choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES, TIPS))
-        parts.append(draw_skin(law, setups[thickness, tip], skin_rng, forces))
+        slide = asdict(draw_law(centre, {name: spreads[name] for name in SLIDE if name in spreads}, skin_rng))
+        laws = law, replace(law, **{name: slide[name] for name in SLIDE})
+        parts.append(draw_skin(laws, setups[thickness, tip], skin_rng, forces))
     return Population(*(np.array(part, np.float32) for part in zip(*parts, strict=True)))
 
 
@@ -122,36 +147,41 @@ def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator
     law = centre
     for name, spread in spreads.items():
         law = perturb(law, name, spread * rng.standard_normal())
-        if name in LEAST and name not in LOGARITHMIC:
+        if name in LEAST:
             law = replace(law, **{name: max(getattr(law, name), LEAST[name])})
     return perturb(law, "amplitude", LOG_AMPLITUDE_PER_MM * (law.gap_mm - centre.gap_mm))
 
 
-def draw_skin(
-    law: Law, setup: Setup, rng: np.random.Generator, forces: Forces = DEFAULT_FORCES
-) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Simulate one skin on imperfect chips.
+def perturb(centre: Law, name: str, by: float) -> Law:
+    """Add `by` to one parameter of a law, or to its logarithm if it is in `LOGARITHMIC`."""
+    value = asdict(centre)[name]
+    return with_parameters(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
 
-    Returns the field changes of its presses, its no-load field, and the places and forces of the presses.
+
+def draw_skin(
+    laws: Sequence[Law], setup: Setup, rng: np.random.Generator, forces: Forces
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate one skin on imperfect chips; `laws` are the laws of its sessions.
+
+    Returns the field changes of its presses in each session, its no-load field, and the places and forces of the
+    presses.
     """
-    place_mm = draw_places(rng, setup.area)
-    force_N = forces.draw(PRESSES_N, rng)
-    if forces.weight_N is not None:
-        place_mm, force_N = np.vstack([place_mm, np.zeros(2)]), np.append(force_N, forces.weight_N)
+    place_mm, force_N = draw_places(rng, setup.area), forces.draw(PRESSES_N, rng)
     filled = fill(setup.rest, rng)
-    db_uT, rest_uT = simulate_uT(law, setup, place_mm, force_N, filled), at_rest_uT(law, setup, filled)
+    db_uT = np.stack([simulate_uT(law, setup, place_mm, force_N, filled) for law in laws])
+    rest_uT = at_rest_uT(laws[0], setup, filled)
     chips_n = len(rest_uT)
     gain = draw_gains(chips_n, rng)
     rest_uT = np.einsum("kij,kj->ki", gain, rest_uT) + CHIP_OFFSET_uT * rng.standard_normal((chips_n, 3))
-    db_uT = np.einsum("kij,nkj->nki", gain, db_uT)
-    return db_uT.reshape(len(place_mm), -1), rest_uT.ravel(), place_mm, force_N
+    db_uT = np.einsum("kij,snkj->snki", gain, db_uT)
+    return db_uT.reshape(*db_uT.shape[:2], -1), rest_uT.ravel(), place_mm, force_N
 
 
 def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.ndarray, "m 2"]:
     """Draw the places of the presses on one skin, in mm from the board's centre.
 
-    The result begins with all places of the grid, for conditioning. It continues with about half of these places again
-    and with places anywhere in the area, for training.
+    The result begins with all places of the grid. It continues with about half of these places again and with places
+    anywhere in the area.
     """
     grid_mm = grid(area)
     anywhere_n = int(PLACES_N * ANYWHERE_SHARE)

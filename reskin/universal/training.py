@@ -1,136 +1,185 @@
-"""Training of the networks of the universal model, with PyTorch.
+"""Training of the network of the universal model, with PyTorch.
 
-The networks are trained on simulated skins and, if available, on recorded boards (`reskin.universal.batches`).
-`reskin.universal.network` describes the network, and evaluates it without PyTorch.
+The network is trained on random episodes of simulated skins and, if there are any, of recorded boards
+(`reskin.universal.episodes`). `reskin.universal.network` describes the network, and evaluates it without PyTorch. This
+training is not exact to the bit: the file of a trained model is an input of everything that uses it.
 """
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
-from torch.nn.functional import huber_loss
+from torch.nn.functional import hardswish, huber_loss, layer_norm, linear, scaled_dot_product_attention
+from tqdm import tqdm
 
-from reskin.models.optimiser import AdamW, one_cycle
-from reskin.models.reproducible import affine, exp
-from reskin.seeds import rng_for
-from reskin.universal.batches import Batch, Batches, SkinPrior, TrainingSettings
+from reskin.universal.episodes import Episodes, RecordedBoard, draw_episodes
 from reskin.universal.network import (
     DIRECTION_GAIN,
-    FULL_SET_N,
+    HEAD,
+    HEADS_N,
     LAYERS_N,
     LOG_SD,
+    WIDTH,
+    EXTERNAL_uT,
     LENGTH_MIN_uT,
     LOG_uT,
     REST_uT,
     Weights,
-    draw_weights,
+    shapes,
 )
-from reskin.universal.population import Population, draw_population
+from reskin.universal.population import Population
 
-# Settings of the optimiser AdamW with a one-cycle schedule: largest learning rate, weight decay, fraction of the steps
-# in which the learning rate rises, and largest norm of the gradient (larger gradients are scaled down).
-RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
+# Settings of the optimiser AdamW: largest learning rate, which rises in the first steps and then falls like a cosine,
+# weight decay, and largest norm of the gradient (larger gradients are scaled down).
+RATE_MAX, WARM_UP_N, WEIGHT_DECAY, GRADIENT_NORM_MAX = 1.2e-3, 300, 1e-4, 1.0
+RATE_OF_TUNING = 3e-4  # largest learning rate if a trained network is trained further
 # The loss is the sum of a Huber loss, which trains the estimates, and a likelihood, which trains the standard
 # deviations. These are the threshold of the Huber loss, its weight, and the weight of the likelihood.
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
 
 
-class Network(nn.Module):
-    """The set encoder and the regressor of `reskin.universal.network` as a PyTorch module.
-
-    The weights have the names that `draw_weights` gives them.
-    """
+class SkinReader(nn.Module):
+    """The network of `reskin.universal.network` as a PyTorch module, with weights of the same names."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
-        self.weights = nn.ParameterDict({name: torch.from_numpy(np.array(value)) for name, value in weights.items()})
+        self.names = {name: name.replace(".", "_") for name in weights}
+        fixed = "usual_rest"
+        self.register_buffer(fixed, torch.from_numpy(np.array(weights[fixed], np.float32)))
+        for name, value in weights.items():
+            if name != fixed:
+                self.register_parameter(self.names[name], nn.Parameter(torch.from_numpy(np.array(value, np.float32))))
 
-    def encode(
-        self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
-        kept: Float[torch.Tensor, "b c"],
-    ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Compute the code of each skin from its no-load field and from those presses for which `kept` is 1.
+    def weights(self) -> dict[str, np.ndarray]:
+        """Return the weights as arrays."""
+        return {name: self._weight(name).detach().numpy().copy() for name in self.names}
 
-        The features of these presses are averaged. If there are no such presses, the averages are 0.
-        """
-        features = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
-        features = torch.relu(self._linear("set2", features)) * kept[..., None]
-        kept_n = kept.sum(1, keepdim=True)
-        pooled = features.sum(1) / kept_n.clamp_min(1)
-        return torch.relu(self._linear("code", torch.cat([pooled, kept_n / FULL_SET_N], 1)))
-
-    def forward(
-        self, db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"],
-        code: Float[torch.Tensor, "b 64"],
-    ) -> tuple[Float[torch.Tensor, "b n 3"], Float[torch.Tensor, "b n 3"]]:  # fmt: skip
-        """Estimate scaled values of x, y and log F for presses on skins with these codes.
-
-        Returns the estimates and the logarithms of their standard deviations.
-        """
-        values = inputs(db_uT, rest_uT)
+    def forward(self, episodes: Episodes) -> tuple[Float[torch.Tensor, "b q 3"], Float[torch.Tensor, "b q 3"]]:
+        """Estimate scaled x, y and log F of the readings; return means and logarithms of standard deviations."""
+        rest = torch.from_numpy(episodes.rest_uT)
+        sign = torch.where(rest @ self._weight("usual_rest") < 0, -1.0, 1.0)[:, None]
+        ambient = sign * rest / REST_uT
+        ambient = torch.cat([ambient, torch.full_like(sign, math.log1p(episodes.external_uT / EXTERNAL_uT))], 1)
+        context, query = (
+            self._embed(sign[:, None] * torch.from_numpy(fields), ambient)
+            for fields in (episodes.context_uT, episodes.query_uT)
+        )
+        labels = torch.from_numpy(episodes.labels)
+        labels_n = labels.shape[1]
+        of_labels = self._linear("label2", hardswish(self._linear("label1", labels)))
+        empty = self._weight("empty").expand(len(rest), 1, WIDTH)
+        context = torch.cat([empty, context[:, :labels_n] + of_labels, context[:, labels_n:]], 1)
         for i in range(LAYERS_N):
-            gain, shift = self._linear(f"film{i}", code)[:, None].chunk(2, -1)
-            values = torch.relu(self._linear(f"layer{i}", values) * (1 + gain) + shift)
-        mean, log_sd = self._linear("answer", values).chunk(2, -1)
+            source = self._norm(f"layer{i}.norm1", context)
+            key, value = (self._heads(self._linear(f"layer{i}.{name}", source)) for name in ("key", "value"))
+            query = self._read(i, query, self._norm(f"layer{i}.norm1", query), key, value)
+            if i < LAYERS_N - 1:
+                context = self._read(i, context, source, key, value)
+        values = hardswish(self._linear("out1", self._norm("norm", query)))
+        mean, log_sd = self._linear("out2", values).chunk(2, -1)
         return mean, log_sd.clamp(*LOG_SD)
 
+    def _embed(self, db: torch.Tensor, ambient: torch.Tensor) -> torch.Tensor:
+        length = db.norm(dim=-1, keepdim=True).clamp_min(LENGTH_MIN_uT)
+        shared = ambient[:, None].expand(*db.shape[:2], ambient.shape[-1])
+        inputs = torch.cat([DIRECTION_GAIN * db / length, length.log() - LOG_uT, shared], -1)
+        return self._linear("embed2", hardswish(self._linear("embed1", inputs)))
+
+    def _read(
+        self, i: int, tokens: torch.Tensor, normed: torch.Tensor, key: torch.Tensor, value: torch.Tensor
+    ) -> torch.Tensor:
+        query = self._heads(self._linear(f"layer{i}.query", normed))
+        read = scaled_dot_product_attention(query, key, value).transpose(1, 2).reshape(tokens.shape)
+        tokens = tokens + self._linear(f"layer{i}.mix", read)
+        hidden = hardswish(self._linear(f"layer{i}.mlp1", self._norm(f"layer{i}.norm2", tokens)))
+        return tokens + self._linear(f"layer{i}.mlp2", hidden)
+
+    def _heads(self, values: torch.Tensor) -> torch.Tensor:
+        return values.view(*values.shape[:2], HEADS_N, HEAD).transpose(1, 2)
+
     def _linear(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        return affine(values, self.weights[f"{name}_weight"].mT, self.weights[f"{name}_bias"][None])
+        return linear(values, self._weight(f"{name}.weight"), self._weight(f"{name}.bias"))
+
+    def _norm(self, name: str, values: torch.Tensor) -> torch.Tensor:
+        return layer_norm(values, (WIDTH,), self._weight(f"{name}.weight"), self._weight(f"{name}.bias"))
+
+    def _weight(self, name: str) -> torch.Tensor:
+        weight = getattr(self, self.names[name])
+        assert isinstance(weight, torch.Tensor)
+        return weight
 
 
-def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Compute the inputs of the network, which are scaled to values of about 1.
+def draw_weights(usual_rest_uT: Float[np.ndarray, " ch"], rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw the weights with which a training begins. Labels have no effect at first."""
+    weights = {}
+    for name, shape in shapes(len(usual_rest_uT)).items():
+        kind = name.rpartition(".")[2]
+        if kind == "weight" and len(shape) == 2:
+            value = rng.uniform(-1, 1, shape) / math.sqrt(shape[1])
+        elif kind == "weight":
+            value = np.ones(shape)
+        else:
+            value = np.zeros(shape)
+        weights[name] = value.astype(np.float32)
+    weights["label2.weight"][:] = 0
+    return weights | {"usual_rest": usual_rest_uT.astype(np.float32)}
 
-    The inputs for a press are the direction of its field change, the logarithm of the magnitude, and the no-load field
-    of the skin. They are computed with NumPy, because the results of `torch.log` differ between processors. The result
-    has no gradients, but training needs none, because the inputs do not depend on weights.
+
+def train(
+    skins: Population,
+    steps_n: int,
+    rng: np.random.Generator,
+    recorded: Sequence[RecordedBoard] = (),
+    start: Weights | None = None,
+) -> dict[str, np.ndarray]:
+    """Train a network and return its weights.
+
+    Parameters
+    ----------
+    skins : simulated skins
+    steps_n : number of training steps
+    rng : generator of the episodes
+    recorded : recorded boards, which are mixed into the episodes
+    start : weights of a trained network that is trained further. By default, a new network is trained.
     """
-    db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
-    length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
-    shape = (*db.shape[:2], rest.shape[-1])
-    parts = [DIRECTION_GAIN * db / length_uT, np.log(length_uT) - LOG_uT, np.broadcast_to(rest[:, None], shape)]
-    return torch.from_numpy(np.concatenate(parts, axis=-1))
+    threads_n = torch.get_num_threads()
+    torch.set_num_threads(1)  # two threads on two busy cores are slower than one
+    try:
+        return _train(skins, steps_n, rng, recorded, start)
+    finally:
+        torch.set_num_threads(threads_n)
 
 
-def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
-    """Simulate skins, train `settings.seeds_n` networks on them one after the other, and return their weights.
-
-    `prior` is the distribution of the skins.
-    """
-    rng = rng_for(seed, "universal", prior.name, "skins")
-    skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng, prior.forces)
-    names = ("universal", prior.name, "network")
-    return [train(skins, prior, settings.steps_n, rng_for(seed, *names, i)) for i in range(settings.seeds_n)]
-
-
-def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Train one network and return its weights."""
-    # With several threads, the order in which numbers are added would vary, and thus the result.
-    torch.set_num_threads(1)
-    network = Network(draw_weights(skins.rest_uT.shape[1], rng))
-    optimizer = AdamW(network.parameters(), WEIGHT_DECAY)
-    batches = Batches(skins, prior)
-    for step_i in range(steps_n):
-        loss = loss_of(network, batches.draw(rng))
-        network.zero_grad()
+def _train(
+    skins: Population, steps_n: int, rng: np.random.Generator, recorded: Sequence[RecordedBoard], start: Weights | None
+) -> dict[str, np.ndarray]:
+    rate_max = RATE_MAX if start is None else RATE_OF_TUNING
+    network = SkinReader(draw_weights(skins.rest_uT.mean(axis=0), rng) if start is None else start)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate_max, weight_decay=WEIGHT_DECAY)
+    for step_i in tqdm(range(steps_n), desc="training", mininterval=10, disable=steps_n < 1000):
+        warm = min(1.0, (step_i + 1) / min(WARM_UP_N, steps_n / 4))
+        rate = rate_max * warm * 0.5 * (1 + math.cos(math.pi * step_i / steps_n)) + 1e-6
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        loss = loss_of(network, draw_episodes(skins, recorded, rng))
+        optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_NORM_MAX)
-        optimizer.step(*one_cycle(step_i, steps_n, RATE_MAX, WARM_UP))
-    return {name: value.detach().numpy().copy() for name, value in network.weights.items()}
+        nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_NORM_MAX)
+        optimizer.step()
+    return network.weights()
 
 
-def loss_of(network: Network, batch: Batch) -> torch.Tensor:
-    """Return the loss of a batch.
+def loss_of(network: SkinReader, episodes: Episodes) -> torch.Tensor:
+    """Return the loss: Huber loss of the estimates, and negative log likelihood of their errors, which are normal.
 
-    The loss is the sum of the Huber loss of the estimates and the negative log likelihood of their errors, which are
-    assumed to be normally distributed.
+    The likelihood trains only the standard deviations. If it also trained the means, presses with large errors would
+    have little influence on the means, because the network would state large standard deviations for them.
     """
-    db_uT, rest_uT = torch.from_numpy(batch.db_uT), torch.from_numpy(batch.rest_uT)
-    target, kept = torch.from_numpy(batch.target), torch.from_numpy(batch.kept)
-    set_n = kept.shape[1]
-    mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
+    mean, log_sd = network(episodes)
+    target = torch.from_numpy(episodes.target)
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
-    # The likelihood trains only the standard deviations. If it also trained the means, presses with large errors would
-    # have little influence on the means, because the network would predict large standard deviations for these presses.
     deviation = (mean - target).detach()
-    return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * exp(-2 * log_sd)).mean()
+    return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * torch.exp(-2 * log_sd)).mean()

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.compare import agreement, compare_boards, figures
+from pipeline.fitting.law_fit import TEN, fit
+from pipeline.fitting.presses import RecordedPresses, pool, thin
 from pipeline.report.tables import compare
 from reskin.recordings.readers import lab
-from reskin.universal.law import TEN, fit, simulate_uT
-from reskin.universal.presses import RecordedPresses, pool, thin
+from reskin.universal.law import simulate_uT
 from tests.benchmarks import FULL
+from tests.fitting.recorded import AXES, SETUP, TRUE, simulated_presses
 from tests.recordings.test_recordings import LAB, ingest
 from tests.report.synthetic import texts_of
-from tests.universal.recorded import AXES, SETUP, TRUE, simulated_presses
 
 
 @pytest.fixture(scope="module")

@@ -66,8 +66,8 @@ def test_results_have_a_row_for_each_aim_and_kind_of_feedback():
     networks = {"b0": [lambda db_uT: true_force(db_uT + 50.0)[:, None] + np.zeros(3)]}
     numbers, figure_data = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
     assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
-        (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
-        (0.5, "map", "label"),
+        (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "shipped", "none"), (0.5, "shipped", "factor"),
+        (0.5, "shipped", "label"),
     ]  # fmt: skip
     assert [row["runs_n"] for row in numbers["rows"]] == [2] * 5
     assert numbers["rows"][0]["held_pct"] == 100

@@ -20,13 +20,14 @@ from reskin.physics import external
 from reskin.recordings.header import HEADER_FILE, render
 from reskin.recordings.readers import leaphand
 from reskin.seeds import rng_for
-from reskin.universal.law import CHIPS_MM, to_chips
+from reskin.universal.layout import paper_layout
 from reskin.universal.model import load_universal
 from tests.recordings.headers import make_header
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDED = ROOT.parent / "shared/data/leaphand"
 NOISE_uT = 4.0
+LAYOUT = paper_layout()
 MODELS = {size_uT: load_universal(external_uT=size_uT) for size_uT in (0.0, 100.0)}
 CI = read_settings("ci", ROOT)
 
@@ -41,7 +42,7 @@ def sensor(**changes_uT: np.ndarray) -> Sensor:
 
 
 def uniform_uT(n: int, size_uT: float) -> np.ndarray:
-    return to_chips(np.tile(size_uT * rng_for(0, "uniform").standard_normal((n, 3)), len(CHIPS_MM)))
+    return LAYOUT.to_chips(np.tile(size_uT * rng_for(0, "uniform").standard_normal((n, 3)), len(LAYOUT.chips)))
 
 
 # --- Contacts ---
@@ -54,8 +55,8 @@ def contacts(of: Sensor, touches_uT: np.ndarray) -> dict:
 
 
 def test_option_removes_false_contacts_in_the_fields_that_it_describes_and_keeps_presses():
-    cov = external.covariance(np.array(CHIPS_MM), 100.0)
-    dipoles_uT = to_chips(rng_for(0, "dipoles").multivariate_normal(np.zeros(15), cov, 300, method="eigh"))
+    cov = external.covariance(LAYOUT.chips_mm, 100.0)
+    dipoles_uT = LAYOUT.to_chips(rng_for(0, "dipoles").multivariate_normal(np.zeros(15), cov, 300, method="eigh"))
     of = sensor(
         none=noise(4000, "none"), uniform=noise(300, "a") + uniform_uT(300, 50.0), magnets=noise(300, "b") + dipoles_uT
     )

@@ -66,7 +66,7 @@ def make_board(seed: int = 1) -> Board:
 
 def case_of(board: Board, labels: np.ndarray, tested: np.ndarray) -> Case:
     none = board.presses[labels[:0]]
-    return Case(board.noload_uT, board.presses.b_uT, board.presses[labels], True, none, board.presses.b_uT[tested])
+    return Case(board.noload_uT, board.presses.b_uT, board.presses[labels], none, board.presses.b_uT[tested])
 
 
 @FEW
@@ -152,7 +152,7 @@ def test_a_row_is_reproduced_by_the_public_interface_from_a_saved_draw():
     rows = score_draw(board, draw, SECTION, {SHIPPED: [InContext(FILE, False, MIDDLE_MM)]}, board.presses)
     saved = tabulate_draws(board, [draw])
     part = {name: group.sort_values("order")["press"].to_numpy() for name, group in saved.groupby("part")}
-    model = reskin.load_universal().zero(board.noload_uT).see(board.presses.b_uT[part["unlabelled"]], area=True)
+    model = reskin.load_universal().zero(board.noload_uT).see(board.presses.b_uT[part["unlabelled"]])
     labels = board.presses[part["labels"][:10]]
     model.label(labels.place_mm, labels.force_N, labels.b_uT)
     readings = board.readings_of(part["tested"])

@@ -18,7 +18,7 @@ from reskin.live.page_recording import LabelledPress, PageRecording
 from reskin.live.server import receive
 from reskin.live.session import PRESSES_N, GuidedPresses, Session
 from reskin.live.skins import SkinFolder
-from reskin.live.tracker import Estimates, NetworkEstimator, UniversalEstimator
+from reskin.live.tracker import Estimates, Labels, NetworkEstimator, UniversalEstimator
 from reskin.live.used_model import MEASURED_FILE, describe, read_measured
 from reskin.models.trained import read_network
 from reskin.recordings import probe
@@ -163,9 +163,8 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
         text = estimator.add_label(tuple(place_mm[i].tolist()), math.nan if unknown else force_N[i], db_uT[i])
         assert text.startswith("calibrated to a labelled press; before, the error of its place was ")
         assert ("force" in text) != unknown
-    labelled = [0, 2]
-    model = load_universal().zero(noload_uT).label(place_mm[labelled], force_N[labelled], b_uT[labelled])
-    expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
+    known_N = np.where(np.arange(3) == 1, np.nan, force_N[:3])
+    expected = load_universal().zero(noload_uT).label(place_mm[:3], known_N, b_uT[:3]).predict(b_uT)
     found = estimator(db_uT.astype(np.float32)).target
     np.testing.assert_allclose(found, expected, atol=0.02)  # The tolerance in mm and N is that of single precision.
     for wrong_mm, wrong_N, message in (
@@ -177,6 +176,30 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, found)
     assert estimator.undo() == "undone: calibration to the last labelled press"
     assert len(estimator.learnt.labels.force_N) == 2
+
+
+def test_refinement_needs_enough_labels_and_can_be_undone(random_pokes, monkeypatch):  # noqa: F811
+    noload_uT, b_uT, place_mm, force_N = random_pokes
+    db_uT = b_uT - noload_uT.mean(axis=0)
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(noload_uT)
+    with pytest.raises(SchemaError, match="at least 20 labels with known forces; got 0"):
+        estimator.refine()
+    assert not describe(estimator, load_universal(), "")["refinable"]
+    typed = Labels(*(np.concatenate([part, part]) for part in (place_mm, force_N, db_uT)))
+    estimator._learn(estimator.learnt._replace(typed=typed, step="labels"))
+    assert describe(estimator, load_universal(), "")["refinable"]
+    before = estimator(db_uT.astype(np.float32)).target
+    weights = {name: value * np.float32(1.01) for name, value in estimator.model.weights.items()}
+    monkeypatch.setattr("reskin.universal.making.refine", lambda *_: weights)
+    assert estimator.refine().startswith("refined the network on 24 labelled presses")
+    refined = estimator(db_uT.astype(np.float32)).target
+    assert np.abs(refined - before).max() > 1e-3
+    assert describe(estimator, load_universal(), "")["learnt"].endswith("; network refined")
+    estimator.set_noload(noload_uT)  # A new no-load reading keeps the refinement.
+    np.testing.assert_allclose(estimator(db_uT.astype(np.float32)).target, refined, rtol=1e-6)
+    assert estimator.undo() == "undone: refinement of the network"
+    np.testing.assert_allclose(estimator(db_uT.astype(np.float32)).target, before, rtol=1e-6)
 
 
 def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
@@ -305,7 +328,7 @@ def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
     np.testing.assert_allclose(press.db_uT, 100.0)
 
 
-def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
+def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pokes):  # noqa: F811
     measured = read_measured(MEASURED_FILE)
     noload_uT, b_uT, place_mm, force_N = random_pokes
     shipped = UniversalEstimator(load_universal())
@@ -314,17 +337,15 @@ def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pok
     for each in measured.places[0].median_mm:  # There is one value for each recorded board.
         assert f"{each:.1f}" in texts["expected"]
     assert all(f"{each:.2g}" in texts["least_force"] for each in measured.detection.lightest_N)
-    assert f"{shipped.model.tables.force_N[0]:.2g} N" in texts["least_force"]
+    assert f"{shipped.model.layout.force_N[0]:.2g} N" in texts["least_force"]
     # For numbers of presses or labels that were not measured, the next smaller measured number is shown.
     many = load_universal().zero(noload_uT).see(np.tile(b_uT, (6, 1))[:65]).label(place_mm, force_N, b_uT)
     texts = describe(UniversalEstimator(many), many, "s1.safetensors")
     assert texts["model"] == "universal model, file s1.safetensors"
     assert texts["learnt"] == "77 presses in the file"
     assert texts["expected"].endswith("after 65 presses and 10 labels)")
-    many.save(tmp_path / "s1.safetensors")
-    later = load_universal(tmp_path / "s1.safetensors", new_day=True)
-    texts = describe(UniversalEstimator(later), later, "s1.safetensors")
-    assert texts["expected"] == "not measured after a calibration on an earlier day"
+    refined = load_universal().zero(noload_uT).use_refined(many.weights)
+    assert describe(UniversalEstimator(refined), refined, "")["expected"] == "not measured for a refined network"
     outside = load_universal(external_uT=30.0)
     assert describe(UniversalEstimator(outside), outside, "")["expected"].endswith("not measured with external fields")
     other = replace(load_universal(), card={"name": "a model of another board"})

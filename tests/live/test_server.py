@@ -66,9 +66,9 @@ def unpack(data: bytes) -> dict:
     values = np.frombuffer(data, "<f4", offset=HEAD.size)
     first = NUMBERS_N + 3 * chips_n
     assert len(values) == first + bins_n * (1 + 2 * (1 + chips_n))
-    names = ("x_mm", "y_mm", "F_N", "sd_x", "sd_y", "contact", "rate_hz", "lost")
-    message = dict(zip(names, values[:8].tolist(), strict=True))
-    message |= dict(zip(("dropped", "true_x_mm", "true_y_mm", "true_F_N"), values[12:16].tolist(), strict=True))
+    names = ("x_mm", "y_mm", "F_N", "sd_x", "sd_y", "sd_F", "contact", "rate_hz", "lost")
+    message = dict(zip(names, values[:9].tolist(), strict=True))
+    message |= dict(zip(("dropped", "true_x_mm", "true_y_mm", "true_F_N"), values[13:17].tolist(), strict=True))
     return message | {"number": number, "t_s": t_s, "bins_n": bins_n, "change_uT": values[NUMBERS_N:first]}
 
 

@@ -9,9 +9,9 @@ from reskin.physics import magnet
 from reskin.physics.ambient import random_directions
 from reskin.physics.external import covariance, suppressor
 from reskin.seeds import rng_for
-from reskin.universal.law import CHIPS_MM
+from reskin.universal.layout import paper_layout
 
-CHIPS = np.array(CHIPS_MM)
+CHIPS = paper_layout().chips_mm
 
 
 def test_covariance_of_external_fields_equals_that_of_random_dipoles():

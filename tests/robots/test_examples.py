@@ -16,7 +16,7 @@ from reskin import cli
 from reskin.robots import ros2, sensor
 from tests.stages.checkout import ROOT
 from tests.test_predicting import write_stream
-from tests.universal.test_export import coarse, quiet
+from tests.universal.skins import draw
 
 PAGE = (ROOT / "docs/robots.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGE, re.DOTALL))
@@ -88,10 +88,12 @@ def test_onnx_examples_of_the_page_export_and_run_a_model(tmp_path, monkeypatch)
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(reskin, "load_universal", lambda file: copy(coarse("unlabelled")))
-    variables = {"noload_uT": quiet(), "b_uT": quiet()[:3]}
+    skin = draw(12)[0]
+    calibrated = reskin.load_universal().zero(skin.rest_uT).see(skin.b_uT[:10])
+    monkeypatch.setattr(reskin, "load_universal", lambda file: copy(calibrated))
+    quiet_uT = skin.rest_uT + np.random.default_rng(0).normal(0, 3, (50, 15))
+    variables = {"noload_uT": quiet_uT, "b_uT": quiet_uT[:3]}
     exec(EXAMPLES["export"], variables)
     exec(EXAMPLES["onnx"], variables)
     assert variables["place_mm"].shape == (3, 2)
     assert not variables["contact"].any()
-    assert (tmp_path / "skin.h").is_file()

@@ -9,7 +9,7 @@ from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from reskin.layouts import FOLDER
 from reskin.universal.layout import read_layout
-from tests.universal.recorded import LAB
+from tests.fitting.recorded import LAB
 
 SQUARE = read_yaml(FOLDER / "reskin.yaml") | {"name": "square", "centre_mm": [10.0, 12.0]}
 

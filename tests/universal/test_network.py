@@ -1,75 +1,96 @@
-"""Tests of the network, whose estimates depend on a set of presses.
+"""Tests of the network: its two implementations agree, and its estimates have the symmetries of their inputs."""
 
-The set may have any number of presses, or none, in any order.
-"""
+import math
 
 import numpy as np
 import pytest
 import torch
 
 from reskin.seeds import rng_for
-from reskin.universal.network import LOG_N, PLACE_MM, draw_weights, predict
-from reskin.universal.training import Network, inputs
+from reskin.universal import network
+from reskin.universal.episodes import Episodes
+from reskin.universal.network import LOG_N, PLACE_MM, Labels
+from reskin.universal.training import SkinReader, draw_weights
 
 RNG = rng_for(0, "network")
-PRESSES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))
-ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
+REST_uT, UNLABELLED_uT, LABELLED_uT, READ_uT = (
+    RNG.normal(0, 300, shape) for shape in ((15,), (20, 15), (6, 15), (7, 15))
+)
+LABELS = Labels(RNG.uniform(-8, 8, (6, 2)), np.array([0.5, np.nan, 2.0, 3.0, np.nan, 9.0]))
+# Weights with which labels have an effect, unlike those with which a training begins.
+WEIGHTS = {
+    name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32)
+    for name, value in draw_weights(REST_uT, RNG).items()
+}
+COMPILED = network.compile_weights(WEIGHTS)
 
 
-def test_order_of_presses_does_not_matter():
-    forward, backward = predict([ONE], READ_uT, REST_uT, PRESSES_uT), predict([ONE], READ_uT, REST_uT, PRESSES_uT[::-1])
-    # The tolerance is rounding, because sums are computed in another order.
-    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)
-    other = predict([ONE], READ_uT, REST_uT, 2 * PRESSES_uT)
-    assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
+def estimate(
+    rest_uT=REST_uT, unlabelled_uT=UNLABELLED_uT, labelled_uT=LABELLED_uT, labels=LABELS, read_uT=READ_uT, **more
+):
+    context = network.read_skin(WEIGHTS, rest_uT, unlabelled_uT, labelled_uT, labels, **more)
+    return np.column_stack(network.estimate(COMPILED, context, read_uT))
 
 
-def test_network_ignores_masked_presses():
-    network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
-    presses = torch.from_numpy(PRESSES_uT[None].astype(np.float32))
-    kept = (torch.arange(20) < 5).float()[None]
-    torch.testing.assert_close(
-        network.encode(presses, rest, kept), network.encode(presses[:, :5], rest, torch.ones(1, 5))
-    )
-    none = predict([ONE], READ_uT, REST_uT, np.empty((0, 15)))
-    assert np.isfinite(none.place_mm).all()
+def first(n):
+    return {"labelled_uT": LABELLED_uT[:n], "labels": Labels(LABELS.place_mm[:n], LABELS.force_N[:n])}
 
 
-def test_inputs_are_the_direction_and_the_log_length_of_field_changes():
-    """Fields that are five times as large have the same direction, and a log length that is larger by log(5)."""
-    rest = torch.zeros(1, 15)
-    near, far = (inputs(torch.from_numpy(size * READ_uT[None].astype(np.float32)), rest) for size in (1.0, 5.0))
-    torch.testing.assert_close(near[..., :15], far[..., :15])
-    torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
-
-
-def test_variance_of_several_networks_includes_their_disagreement():
-    one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
-    both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
-    np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
-    variance = (one.sd_mm**2 + other.sd_mm**2) / 2 + (one.place_mm - other.place_mm) ** 2 / 4
-    np.testing.assert_allclose(both.sd_mm**2, variance, rtol=1e-6)
-
-
-@pytest.mark.parametrize("chips_n", [1, 5])
-def test_network_can_be_built_for_any_number_of_chips(chips_n):
-    weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
-    assert predict(
-        [weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], PRESSES_uT[:, : 3 * chips_n]
-    ).log_N.shape
-
-
-@pytest.mark.parametrize("presses_n", [0, 20])
-def test_network_in_numpy_equals_that_in_pytorch(presses_n):
-    weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
-    found = predict([weights], READ_uT, REST_uT, PRESSES_uT[:presses_n])
-    read, rest, presses = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, PRESSES_uT))
+@pytest.mark.parametrize(("unlabelled_n", "labels_n", "external_uT"), [(0, 0, 0.0), (20, 0, 0.0), (5, 6, 100.0)])
+def test_numba_equals_pytorch(unlabelled_n, labels_n, external_uT):
+    known = np.isfinite(LABELS.force_N[:labels_n])
+    log_N = np.where(known, np.log(np.where(known, LABELS.force_N[:labels_n], 1)), 0) / LOG_N
+    of_labels = np.column_stack([LABELS.place_mm[:labels_n] / PLACE_MM, log_N, np.ones(labels_n), known])
+    context_uT = np.concatenate([LABELLED_uT[:labels_n], UNLABELLED_uT[:unlabelled_n]])
+    parts = (REST_uT, context_uT, of_labels, READ_uT, np.zeros((7, 3)))
+    episodes = Episodes(*(part[None].astype(np.float32) for part in parts), external_uT)
     with torch.no_grad():
-        network = Network(weights)
-        kept = (torch.arange(20) < presses_n).float()[None]
-        mean, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(presses, rest, kept)))
-    found_mean = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
-    found_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
-    # The tolerance is rounding, because sums are computed in another order.
-    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(np.log(found_sd), log_sd, rtol=1e-5, atol=1e-5)
+        mean, log_sd = (part[0].double().numpy() for part in SkinReader(WEIGHTS)(episodes))
+    found = estimate(unlabelled_uT=UNLABELLED_uT[:unlabelled_n], external_uT=external_uT, **first(labels_n))
+    scale = np.array([PLACE_MM, PLACE_MM, LOG_N])
+    expected = np.column_stack([mean * scale, np.exp(log_sd) * scale])
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)  # single precision
+
+
+def test_order_of_presses_does_not_matter_and_each_one_counts():
+    found = estimate()
+    reversed_labels = Labels(LABELS.place_mm[::-1], LABELS.force_N[::-1])
+    backward = estimate(unlabelled_uT=UNLABELLED_uT[::-1], labelled_uT=LABELLED_uT[::-1], labels=reversed_labels)
+    np.testing.assert_allclose(backward, found, atol=1e-4)
+    changes = (
+        {"unlabelled_uT": UNLABELLED_uT[:-1]}, first(5), {"rest_uT": REST_uT + 100},
+        {"labels": Labels(LABELS.place_mm + 1, LABELS.force_N)},
+        {"labels": Labels(LABELS.place_mm, LABELS.force_N / 2)},
+        {"external_uT": 100.0},
+    )  # fmt: skip
+    for change in changes:
+        assert np.abs(estimate(**change) - found).max() > 1e-3
+
+
+def test_a_reading_is_estimated_by_itself():
+    np.testing.assert_allclose(estimate(read_uT=READ_uT[2:3]), estimate()[2:3], rtol=1e-6)
+    assert estimate(read_uT=READ_uT[:0]).shape == (0, 6)
+
+
+def test_reversed_magnets_do_not_matter():
+    negated = estimate(-REST_uT, -UNLABELLED_uT, -LABELLED_uT, read_uT=-READ_uT)
+    np.testing.assert_allclose(negated, estimate(), rtol=1e-6)
+
+
+def test_a_reading_that_is_not_a_number_gives_no_number():
+    read_uT = READ_uT.copy()
+    read_uT[3, 4] = math.nan
+    found = estimate(read_uT=read_uT)
+    assert np.isnan(found[3]).all()
+    assert np.isfinite(np.delete(found, 3, axis=0)).all()
+
+
+@pytest.mark.parametrize("chips_n", [1, 8])
+def test_network_for_any_number_of_chips(chips_n):
+    channels_n, none = 3 * chips_n, Labels(np.zeros((0, 2)), np.zeros(0))
+    weights = draw_weights(np.ones(channels_n), rng_for(0, "chips"))
+    assert {name: value.shape for name, value in weights.items()} == network.shapes(channels_n)
+    empty = np.zeros((0, channels_n))
+    context = network.read_skin(weights, np.ones(channels_n), empty, empty, none)
+    found = network.estimate(network.compile_weights(weights), context, RNG.normal(0, 100, (4, channels_n)))
+    assert np.isfinite(np.column_stack(found)).all()

@@ -2,7 +2,7 @@
 // of the board, and as curves over time (traces). JSON messages (Session.state) are displayed as texts. Each board has its own
 // socket, state and canvases, so that an unplugged board does not affect the other boards.
 "use strict";
-const NUMBERS_N = 16, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
+const NUMBERS_N = 17, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
 const FONT = "13px system-ui, sans-serif";
 const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // the first colour is that of the force, and the others are those of the chips
 const style = getComputedStyle(document.documentElement); // this object is updated by the browser when the colour scheme changes
@@ -26,6 +26,7 @@ class Board {
     this.onSubmit("save_form", () => ({save: this.parts.name.value}));
     this.onSubmit("load_form", () => ({load: this.parts.saved.value}));
     this.onSubmit("undo_form", () => ({press: "undo"}));
+    this.onSubmit("refine_form", () => ({press: "refine"}));
     this.onSubmit("label_form", () => this.state.label_mm ? {label: null} : {label: {x_mm: this.parts.x.valueAsNumber, y_mm: this.parts.y.valueAsNumber,
       force_N: this.parts.force_N.value === "" ? null : this.parts.force_N.valueAsNumber, learn: this.parts.learn.checked}});
     this.connect();
@@ -63,8 +64,8 @@ class Board {
   take(data) {
     const view = new DataView(data), chips = view.getUint16(4, true), bins = view.getUint16(6, true);
     const values = new Float32Array(data, HEAD_BYTES_N), width = 1 + chips, first = NUMBERS_N + 3 * chips;
-    const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99, dropped, trueX, trueY, trueForce] = values;
-    this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
+    const [x, y, force, sdX, sdY, sdForce, contact, rate, lost, estimate50, estimate99, screen50, screen99, dropped, trueX, trueY, trueForce] = values;
+    this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, sdForce, contact, rate, lost, estimate50, estimate99, screen50,
       screen99, dropped, trueX, trueY, trueForce, change: values.slice(NUMBERS_N, first)};
     if (bins) { // the newest bin of the previous message is replaced, because readings may have been added to it since then
       const low = first + bins, high = low + bins * width, t = view.getFloat64(8, true), bin = (i) => Math.round((t + values[first + i]) / BIN_S);
@@ -91,6 +92,7 @@ class Board {
     this.parts.emulated.hidden = !state.true_places;
     this.parts.skinbox.hidden = this.parts.learn.parentElement.hidden = !state.adaptable;
     this.parts.undo.disabled = !state.undoable;
+    this.parts.refine.disabled = !state.refinable;
     const skins = state.skins || [];
     if (skins.join() !== this.skins) { this.skins = skins.join(); this.parts.saved.replaceChildren(...skins.map((name) => new Option(name))); }
     this.parts.load.disabled = !skins.length;
@@ -157,7 +159,7 @@ class Board {
     this.say("off", this.truthShown() ? this.truthText() : "(this board is emulated, so the true place is known; it is not touched at the crosses that Places shows)");
     const sure = (sd) => Number.isNaN(sd) ? "" : ` ± ${sd.toFixed(1)}`, among = Number.isNaN(last.sdX) || state.adaptable ? "" : " between models";
     this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${last.x.toFixed(1)}${sure(last.sdX)}, y ${last.y.toFixed(1)}${sure(last.sdY)} mm${among}` : last.contact ? "contact" : "no contact");
-    this.say("force", number(last.force, 2, "N"));
+    this.say("force", last.contact && !Number.isNaN(last.sdForce) ? `${last.force.toFixed(2)} ± ${last.sdForce.toFixed(2)} N` : number(last.force, 2, "N"));
     this.say("rate", number(last.rate, 0, "Hz")); this.say("lost", number(last.lost, 0, "")); this.say("dropped", number(last.dropped, 0, ""));
     const zeros = state.zero_bins || [], ago_s = zeros.length ? (this.rows[this.rows.length - 1].n - zeros[zeros.length - 1]) * BIN_S : NaN;
     this.say("zeroed", zeros.length ? `${state.zeroings_n} ${state.zeroings_n === 1 ? "time" : "times"}, last ${Math.max(ago_s, 0).toFixed(0)} s ago` : "not yet");

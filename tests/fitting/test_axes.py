@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from reskin.universal.axes import BoardAxes
-from tests.universal.skins import SETUP
+from pipeline.fitting.axes import BoardAxes
+from reskin.universal.layout import paper_layout
 
+SETUP = paper_layout().setup()
 AXES = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True, stated_by="a test")
 
 

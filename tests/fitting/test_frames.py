@@ -6,6 +6,9 @@ from itertools import product
 import numpy as np
 import pytest
 
+from pipeline.fitting.axes import BoardAxes
+from pipeline.fitting.frames import TURNS, find_departure, frames_of, quarter_turn
+from pipeline.fitting.presses import RecordedPresses
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
 from reskin.config import read_yaml
@@ -13,13 +16,10 @@ from reskin.errors import ParamsError
 from reskin.layouts import FOLDER
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
-from reskin.universal.axes import BoardAxes
-from reskin.universal.frames import TURNS, find_departure, frames_of, quarter_turn
 from reskin.universal.law import nominal_uT
-from reskin.universal.presses import RecordedPresses
 from tests.data.tables import readings
+from tests.fitting.recorded import AXES, simulated_presses
 from tests.recordings.test_recordings import ingest
-from tests.universal.recorded import AXES, simulated_presses
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.fitting.presses import RecordedPresses
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
 from reskin.config import read_yaml
 from reskin.seeds import rng_for
 from reskin.universal import law
-from reskin.universal.presses import RecordedPresses
 
 LAB = Path(__file__).resolve().parents[2] / "pipeline/scenes/lab.yaml"
 AXES = Settings("lab", str(LAB), read_yaml(LAB), {}).section(Compare, "compare").axes

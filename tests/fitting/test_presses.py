@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.fitting.presses import cosines, explained, growth, pool
 from reskin.errors import ParamsError, SchemaError
-from reskin.universal.presses import cosines, explained, growth, pool
 from tests.data.tables import readings
-from tests.universal.recorded import AXES, simulated_presses
+from tests.fitting.recorded import AXES, simulated_presses
 
 
 def test_measures_of_agreement_have_the_expected_values_for_simple_fields():

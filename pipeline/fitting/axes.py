@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from pipeline.fitting.law_fit import AlignedPresses
+from pipeline.fitting.presses import RecordedPresses
 from reskin.errors import ParamsError
 from reskin.schema import AXES_PER_CHIP_N
-from reskin.universal.law import AlignedPresses, Setup
-from reskin.universal.presses import RecordedPresses
+from reskin.universal.law import Setup
 
 
 @dataclass(frozen=True)

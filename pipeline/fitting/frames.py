@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from pipeline.fitting.axes import BoardAxes
+from pipeline.fitting.law_fit import AlignedPresses
+from pipeline.fitting.presses import pool, thin
 from reskin.schema import Readings
-from reskin.universal.axes import BoardAxes
-from reskin.universal.law import AlignedPresses, nominal_uT
-from reskin.universal.presses import pool, thin
+from reskin.universal.law import nominal_uT
 
 # For each chip, a cosine tells how well the directions of the recorded and the simulated fields agree. An orientation
 # that differs from the stated one is reported only if it raises the sum of the chips' cosines by this much. The value

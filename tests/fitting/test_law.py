@@ -5,10 +5,11 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from pipeline.fitting import law_fit
+from pipeline.fitting.frames import quarter_turn
 from reskin.physics import layer
 from reskin.universal import law
-from reskin.universal.frames import quarter_turn
-from tests.universal.recorded import AXES, SETUP, TRUE, simulated_presses
+from tests.fitting.recorded import AXES, SETUP, TRUE, simulated_presses
 
 # The tolerances are the errors of a fit to 50 presses with 3 uT of noise. The tolerances of gap and amplitude are
 # large, because an error of the gap can be compensated by an error of the amplitude.
@@ -16,17 +17,17 @@ TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 
 
 def test_fit_recovers_the_parameters_of_a_simulated_skin():
-    fitted = asdict(law.fit(AXES.align(simulated_presses()), SETUP, law.TEN))
+    fitted = asdict(law_fit.fit(AXES.align(simulated_presses()), SETUP, law_fit.TEN))
     for name, true in asdict(TRUE).items():
         assert fitted[name] == pytest.approx(true, abs=asdict(TOLERANCES)[name]), name
 
 
 def test_second_fit_for_a_single_board_changes_only_the_parameters_of_this_board():
     start = replace(law.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
-    fitted = law.fit(AXES.align(simulated_presses(replace(TRUE, rotation_deg=2.0))), SETUP, law.SEVEN, start)
+    fitted = law_fit.fit(AXES.align(simulated_presses(replace(TRUE, rotation_deg=2.0))), SETUP, law_fit.SEVEN, start)
     assert fitted.rotation_deg == pytest.approx(2.0, abs=0.3)
     assert (fitted.seat_x_mm, fitted.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
-    assert [getattr(fitted, name) for name in law.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
+    assert [getattr(fitted, name) for name in law_fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
 
 
 def test_flipped_checkerboard_skin_equals_the_skin_rotated_by_a_quarter_turn():
