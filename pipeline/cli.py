@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from pipeline import PLAN
-from reskin.cli import BOARD, MAINTENANCE, PIPELINE, RECORDINGS, Wire
+from reskin.cli import BOARD, MAINTENANCE, PIPELINE, RECORDINGS, WIRE
 from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
@@ -124,11 +124,8 @@ def add(
         float | None, Option("--rate-hz", help="Layouts serial-*: frames per second. Default: 400.")
     ] = None,
     wire: Annotated[
-        Wire | None,
-        Option(
-            help="Layouts serial-*: format in which the board sent the readings. Default: binary for serial-binary, "
-            "text-xyzt for serial-text."
-        ),
+        str | None,
+        Option(help=f"Layouts serial-*. {WIRE} Default: binary for serial-binary, text-xyzt for serial-text."),
     ] = None,
     mark: Marks = None,
     rows_late: Annotated[
@@ -151,6 +148,10 @@ def add(
             min=1,
         ),
     ] = None,
+    columns: Annotated[
+        Path | None,
+        Option(help="Layout table: YAML file that maps the columns and units of the file (docs/add-a-skin.md)."),
+    ] = None,
     allow_copy: Annotated[
         bool,
         Option(
@@ -169,7 +170,7 @@ def add(
     from pipeline.plan import next_command
     from reskin.recordings.preparing import CaptureNames, suggesting_layout
 
-    options = Options(probe, mark, chips_n, rate_hz, wire, rows_late, force_axis, pad)
+    options = Options(probe, mark, chips_n, rate_hz, wire, rows_late, force_axis, pad, columns)
     options.check(layout)
     for option, value in (("--name", name), ("--skin", skin), ("--probe", probe), ("--mark", mark)):
         if value is not None and len(recordings) > 1:
@@ -322,17 +323,31 @@ def make_model(
             "file with the same name."
         ),
     ],
+    recordings: Annotated[
+        Path | None,
+        Option(
+            help="Recorded boards of this layout with known places and forces: a scene, or a folder of Parquet files "
+            "of readings. The model is also trained with them, and each is held out once to say how good such a model "
+            "is on a new board."
+        ),
+    ] = None,
+    mirrored: Annotated[
+        bool,
+        Option(
+            help="The y axis of the labels in the recordings is opposite to the y axis of the board. If --layout is "
+            "the file of a scene, the scene states this."
+        ),
+    ] = False,
+    start: Annotated[
+        Path | None,
+        Option(help="Model that is trained further with the recordings. Default: the shipped one, for layout reskin."),
+    ] = None,
 ) -> None:
-    """Simulate skins on your board, and train a universal model for it.
+    """Train a universal model for your board, on simulated skins and, if there are any, on recorded boards.
 
-    This takes a few minutes and needs PyTorch.
+    Without recordings, this takes about ten minutes of one core. It needs PyTorch and scikit-learn.
     """
-    from pipeline.training import shipping
+    from pipeline.training.board_model import make
 
-    shipping.make(layout, out, typer.echo)
+    make(layout, out, recordings, start, mirrored=mirrored, say=typer.echo)
     typer.echo(f"wrote {out}. Next: reskin live --model {out}")
-
-
-# `reskin --help` lists groups of commands in the order in which their first commands are registered. Sorting puts the
-# group of maintenance commands last.
-app.registered_commands.sort(key=lambda command: command.rich_help_panel == MAINTENANCE)

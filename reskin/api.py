@@ -417,22 +417,18 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(
-    calibration: Path | str | None = None,
-    *,
-    file: Path | str | None = None,
-    external_uT: float = 0.0,
-    new_day: bool = False,
+    skin: Path | str | None = None, *, file: Path | str | None = None, external_uT: float = 0.0
 ) -> Universal:
     """Load the universal model, which estimates contacts on skins that it was not trained on.
 
     The model needs at least the no-load reading of your skin (method `zero`). Further data of the skin make its
-    estimates more accurate: presses at unknown places (method `see`) and presses at known places (method `label`). The
-    method `next_place` proposes where to press next, and `save` writes the calibration to a file.
+    estimates more accurate: presses at unknown places (method `see`) and presses at known places (method `label`). With
+    many labels, `refine` trains the network further. `save` writes what is known of the skin to a file.
 
     Parameters
     ----------
-    calibration : path, optional
-        A calibration file that `save` wrote. The returned model has this calibration, which can be continued.
+    skin : path, optional
+        A file that `save` wrote. The returned model is calibrated to this skin, and can be calibrated further.
     file : path, optional
         A model (.safetensors, with its JSON card) that `reskin model make` made for the layout of a board. Default: the
         model for the paper's board, which comes with the library.
@@ -440,10 +436,6 @@ def load_universal(
         Size of the external fields, for a board that a robot moves. When the board turns, the external field at its
         chips changes, for example the earth's field. `external_uT` is the standard deviation of each component of this
         change since the no-load reading. It is about 30 for the earth's field. Default: 0, for a board at rest.
-    new_day : bool
-        Whether the calibration was saved on an earlier day. A skin on its board slides a little under presses, and may
-        do so in another way on another day. With True, the model uses a few further presses to find out how the skin
-        slides now (see `Universal.slide`). Default: False, which assumes that it slides as before.
 
     Returns
     -------
@@ -452,8 +444,8 @@ def load_universal(
     Raises
     ------
     ReskinError
-        If a file is missing or of a wrong kind, if the calibration was made with a model for another board, if
-        `external_uT` is out of range, or if `new_day` is True without a calibration.
+        If a file is missing or of a wrong kind, if the skin was saved with a model for another board, or if
+        `external_uT` is out of range.
 
     Examples
     --------
@@ -465,7 +457,7 @@ def load_universal(
     from reskin.universal.model import FILE
     from reskin.universal.model import load_universal as load
 
-    return load(calibration, file=FILE if file is None else file, external_uT=external_uT, new_day=new_day)
+    return load(skin, file=FILE if file is None else file, external_uT=external_uT)
 
 
 def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 400.0) -> pd.DataFrame:
@@ -523,10 +515,12 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
 
 
 @overload
-def open(port: str, *, model: AnyModel = (), baud: int = 115200) -> LiveSkin: ...
+def open(port: str, *, model: AnyModel = (), baud: int = 115200, wire: str | None = None) -> LiveSkin: ...
 @overload
-def open(port: list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkins: ...
-def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkin | LiveSkins:
+def open(port: list[str], *, model: AnyModel = (), baud: int = 115200, wire: str | None = None) -> LiveSkins: ...
+def open(
+    port: str | list[str], *, model: AnyModel = (), baud: int = 115200, wire: str | None = None
+) -> LiveSkin | LiveSkins:
     """Read contacts from one or several boards as they happen. Use the result in a `with` statement.
 
     The `with` statement opens the port, detects the wire format (how a board encodes its readings) and the number of
@@ -547,6 +541,10 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
         For a board that a robot moves, pass `load_universal(external_uT=...)`.
     baud : int
         Baud rate of the serial port. Ports of boards that are connected by USB ignore it.
+    wire : str, optional
+        The format of other firmware: `text:` with the names of the columns of a line, such as
+        `text:Bx0,By0,Bz0,Bx1,By1,Bz1`, or the name of a YAML file (docs/live.md). Default: one of the known formats,
+        which is detected.
 
     Returns
     -------
@@ -569,13 +567,14 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     ...     for contact in skin:
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
     """
+    from reskin.board.custom import custom_wire
     from reskin.live.tracker import LiveSkin, LiveSkins, check_ports
 
-    models = _load_all(model)
+    models, custom = _load_all(model), custom_wire(wire, "wire")
     if isinstance(port, str):
-        return LiveSkin(port, models, baud=baud)
+        return LiveSkin(port, models, baud=baud, wire=custom)
     check_ports(port, models, "reskin.open")
-    return LiveSkins([LiveSkin(name, models, baud=baud) for name in port])
+    return LiveSkins([LiveSkin(name, models, baud=baud, wire=custom) for name in port])
 
 
 def _load_all(model: AnyModel) -> Sequence[Network] | Universal:

@@ -42,7 +42,10 @@ app = typer.Typer(
     epilog=f"In a checkout of the project, there are also the commands {', '.join(CHECKOUT_COMMANDS)}.",
 )
 
-Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
+WIRE = (
+    "Format in which the board sends readings: binary, binary-clock, text-xyzt, text-txyz, or that of other firmware: "
+    "text: with the columns of a line, such as text:Bx0,By0,Bz0,Bx1,By1,Bz1, or a YAML file (docs/live.md)."
+)
 Chips = Annotated[int, Option("--chips", help="Number of chips in a frame.", min=1, max=64)]
 SOURCE = "The folder of a capture, `nominal` (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = (
@@ -84,10 +87,6 @@ MODEL = (
 EXTERNAL = (
     "Expected change of the external field in uT, for a board that moves (docs/live.md). Only the universal model has "
     "this option."
-)
-NEW_DAY = (
-    "State that the calibration was saved on an earlier day. Under presses, the skin may now slide in another way than "
-    "on that day, so the model determines again how it slides (docs/live.md)."
 )
 USUAL_COUNTS = {  # counts in the result of `predict` that do not indicate a fault
     "rate_hz", "duration_s", "readings_n", "quiet_start_s", "noise_uT", "contact_readings_n", "contacts_n",
@@ -218,9 +217,7 @@ def record(
     ] = None,
     skin: Annotated[str | None, Option(help="Name of the skin. You can also give it later, to `reskin add`.")] = None,
     out: Annotated[Path | None, Option(help="Folder to create for the capture. Default: captures/DATE-TIME.")] = None,
-    wire: Annotated[
-        Wire | None, Option(help="With --port: the format in which the board sends readings. Default: binary.")
-    ] = None,
+    wire: Annotated[str | None, Option(help=f"With --port. {WIRE} Default: binary.")] = None,
     chips_n: Annotated[
         int | None, Option("--chips", help="With --port: number of chips of the board. Default: 5.", min=1, max=64)
     ] = None,
@@ -241,6 +238,7 @@ def record(
     With --labels, the places and forces of presses are recorded too. Labels from the log of a robot can also be added
     later, with `reskin add`.
     """
+    from reskin.board.custom import CustomWire, read_wire
     from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
@@ -254,7 +252,9 @@ def record(
         detected = find_board()
         typer.echo(str(detected))
     else:
-        detected = DetectedBoard(port, None, wire or "binary", chips_n or 5)
+        given_wire = read_wire(wire or "binary")
+        own_n = given_wire.chips_n if isinstance(given_wire, CustomWire) else 5
+        detected = DetectedBoard(port, None, given_wire, chips_n or own_n)
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}
     result = record_board(
@@ -358,7 +358,7 @@ def live(
     http_port: Annotated[int, Option(help="TCP port at which the page is served.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
-    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
+    wire: Annotated[str | None, Option(help=f"{WIRE} Default: detected among the known ones.")] = None,
     skins: Annotated[Path, Option(help="Folder in which the page saves the calibrations of skins.")] = Path("skins"),
 ) -> None:
     """Show boards live on a page in the browser: readings of the chips, contacts, forces, traces over time and alarms.
@@ -367,6 +367,7 @@ def live(
     """
     from contextlib import ExitStack
 
+    from reskin.board.custom import custom_wire
     from reskin.board.find import find_boards
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
@@ -381,7 +382,8 @@ def live(
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
-    models, skin_folder = read_models(model or (), external_uT, new_day=new_day), SkinFolder(skins)
+    custom = custom_wire(wire)
+    models, skin_folder = read_models(model or (), external_uT), SkinFolder(skins)
     with ExitStack() as stack:
         description, emulated = "a board", None
         if source := replay or emulate:
@@ -390,8 +392,9 @@ def live(
             emulated = stack.enter_context(playing(script))
             port, description = [emulated.port], f"{script.source}: {source}, played"
         sessions = open_sessions(
-            port or [found.port for found in find_boards()], models, description, fault_policy, skins=skin_folder,
-            model_name=", ".join(file.name for file in model or ()), emulated=emulated,
+            port or [found.port for found in find_boards(wire=custom)], models, description, fault_policy,
+            skins=skin_folder, wire=custom, emulated=emulated,
+            model_name=", ".join(file.name for file in model or ()),
         )  # fmt: skip
         _warn_of_absent_ports(port or ())
         where = f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}"
@@ -411,16 +414,23 @@ def _warn_of_absent_ports(ports: Sequence[str]) -> None:
 @app.command(rich_help_panel=RECORDINGS)
 def decode(
     stream: Annotated[Path, Argument(help="A file with the raw bytes that were read from a port.")],
-    out: Annotated[Path, Option(help="The Parquet file to write.")],
-    wire: Annotated[Wire, Option(help="The format in which the board sent its readings.")] = "binary",
+    out: Annotated[Path, Option(help="The file to write: CSV if its name ends in .csv, otherwise Parquet.")],
+    wire: Annotated[str, Option(help=WIRE)] = "binary",
     chips_n: Chips = 5,
 ) -> None:
     """Decode raw bytes that were read from a port; write a table with one row per frame, and count the lost bytes."""
     from reskin import io
+    from reskin.board.custom import CustomWire, read_wire
     from reskin.recordings.decode import decode_dump
+    from reskin.recordings.tables import render_csv
 
-    table, counts = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
-    io.write_table(out, table)
+    form = read_wire(wire)
+    chips_n = form.chips_n if isinstance(form, CustomWire) else chips_n
+    table, counts = decode_dump(io.read_bytes(stream), form, chips_n, str(stream))
+    if out.suffix == ".csv":
+        io.write_text(out, render_csv(table))
+    else:
+        io.write_table(out, table)
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
 
 
@@ -438,7 +448,6 @@ def predict(
         ),
     ] = 400.0,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
-    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
 ) -> None:
     """Estimate contacts, places and forces from a log, and write them to a CSV file.
 
@@ -447,7 +456,7 @@ def predict(
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
-    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT, new_day=new_day)
+    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT)
     typer.echo(f"wrote {out}: {_describe_log(counts)}")
     for sentence in warnings(counts):
         typer.echo(sentence)

@@ -64,6 +64,7 @@ class MachineError(ReskinError):
 # are installed by the extra `pipeline`.
 EXTRAS = {
     "torch": "train",
+    "sklearn": "train",
     "onnx": "onnx",
     "onnxruntime": "onnx",
     "dask": "dask",
@@ -150,6 +151,6 @@ def missing_package(package: str, where: object, *, extra: str | None = None) ->
     """
     extra = extra or EXTRAS.get(package, "pipeline")
     return ParamsError(
-        f"{where}: the Python package `{package}` is not installed. To install it, run in the checkout: pip install "
+        f"{where}: the Python package `{package}` is not installed. To install it, run in the checkout: pip install -e "
         f"'.[{extra}]'"
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
+from scipy.special import ndtri
 
 from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.errors import CaptureError
@@ -20,9 +21,11 @@ from reskin.metrics import score
 # mean field of each window is compared with the mean field at the start of the log.
 WINDOW_S = 0.1
 QUIET_MIN_S = 0.5  # shortest quiet start whose mean field is assumed to be a reliable no-load reading
-# A window is quiet if, in every channel, its mean differs from the mean at the start by at most this number of standard
-# errors. With 15 channels, noise alone causes a larger difference in 1 of 1,000 windows.
-WANDER_SDS = 4.0
+# Share of logs of pure noise that may be refused because a window seems to differ from the start. From this follows by
+# how many standard errors the mean of a channel may differ, for the number of channels and of windows.
+FALSE_SHARE = 0.002
+FEW_READINGS = 1.5  # the limit is larger by this number divided by the square root of the number of readings
+NORMAL_1SD = 0.683  # this share of normally distributed numbers is within one standard deviation
 START_WINDOWS_N = 2  # number of windows that are the start of the log, from which mean and noise are estimated
 POINTS_MAX_N = 1500  # largest number of points that a curve in a figure has
 
@@ -82,8 +85,9 @@ def estimate_after(
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
     """Return the number of readings in the quiet start of a log.
 
-    The log is divided into windows of 0.1 s. The quiet start ends before the first window in which the mean of any
-    channel differs by more than 4 standard errors from the channel's mean over the first two windows.
+    The log is divided into windows of 0.1 s, or of two readings of slow boards. The quiet start ends before the first
+    window in which the mean of any channel differs from the channel's mean over the first two windows by more than
+    noise would explain.
 
     Raises CaptureError if the quiet start is shorter than 0.5 s.
     """
@@ -93,11 +97,16 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # The noise is estimated from the differences between consecutive readings. It could also be estimated from the
-        # readings themselves, but a contact in the first two windows would then increase the estimate.
-        sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
-        error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
-        moved = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
+        # The noise is estimated from the differences between consecutive readings of the whole log, of which presses
+        # change few. If the noise is smaller than the step of a chip, most differences are 0.
+        steps_uT = np.abs(np.diff(b_uT.astype(np.float64), axis=0))
+        typical_uT = np.quantile(steps_uT, NORMAL_1SD, axis=0)
+        usual_uT = np.where(typical_uT > 0, typical_uT, np.diff(first_uT, axis=0).std(axis=0))
+        error_uT = usual_uT / np.sqrt(2) * np.sqrt(1 / window_n + 1 / start_n)
+        tests_n = b_uT.shape[1] * max(round(QUIET_MIN_S / (window_n * step_s(t_s))), START_WINDOWS_N + 1)
+        # A noise that is estimated from few readings may be too small.
+        limit_sds = -float(ndtri(FALSE_SHARE / tests_n / 2)) * (1 + FEW_READINGS / np.sqrt(len(b_uT)))
+        moved = (np.abs(means_uT - first_uT.mean(axis=0)) > limit_sds * error_uT).any(axis=1)
         quiet_n = window_n * (int(moved.argmax()) if moved.any() else windows_n)
     else:
         quiet_n = 0

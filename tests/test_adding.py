@@ -17,8 +17,8 @@ from pipeline.manage import new as creating
 from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_scene
 from pipeline.settings import read_settings
+from pipeline.training.board_model import read_layout_of
 from pipeline.training.recorded import Compare
-from pipeline.training.shipping import read_layout_of
 from reskin import config
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, ReskinError
@@ -32,13 +32,13 @@ from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
 from reskin.universal.layout import paper_layout
 from tests.board.signals import make_frames
+from tests.fields import fields_uT
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import PRESSES, row, write
 from tests.recordings.readers.test_leaphand import numbers
 from tests.recordings.readers.test_leaphand import write as write_leaphand
 from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout, copy_without_code, run
-from tests.universal.skins import fields_uT
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
             raise found
         return found
 
-    monkeypatch.setattr("reskin.universal.frames.find_departure", find_departure)
+    monkeypatch.setattr("pipeline.fitting.frames.find_departure", find_departure)
     arguments = recorded_scene()
     arguments["experiments"] = [*arguments["experiments"], "compare"]
     arguments["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
@@ -126,11 +126,18 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
     assert str(found or "") in stderr
 
 
+@pytest.mark.parametrize(("factor", "named"), [(1.0, False), (0.1, True), (1e3, True)])
+def test_places_in_another_unit_are_named(factor, named):
+    place_mm = factor * np.array([(x, y) for x in (1.0, 6, 15) for y in (1.0, 8, 15)])
+    chips_mm = np.array([[-5.0, 0], [5, 0], [0, 5], [0, -5], [0, 0]])
+    assert ("convert them to mm" in add._other_unit(place_mm, chips_mm)) == named
+
+
 def test_recording_is_not_compared_with_the_skin_if_the_scene_has_no_section_compare(
     root, lab_file, monkeypatch, capsys
 ):
     monkeypatch.setattr(
-        "reskin.universal.frames.find_departure", lambda *_: pytest.fail("find_departure must not be called")
+        "pipeline.fitting.frames.find_departure", lambda *_: pytest.fail("find_departure must not be called")
     )
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
@@ -462,7 +469,7 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
     assert read_settings("mine", root).section(NewBoard, "new_board").model is None
     layout = read_settings("mine", root).section(Compare, "compare").layout
     assert layout == paper_layout().model_copy(update={"name": "mine"})
-    assert read_layout_of(root / SCENES / "mine.yaml") == layout
+    assert read_layout_of(root / SCENES / "mine.yaml")[0] == layout
     assert "exists already. Choose another name" in output_of(["new", "mine", "--boards", "b1,b2", "--presses", "60"])
     assert "one board cannot be held out" in output_of(["new", "one", "--boards", "b1", "--presses", "60"])
     own = tmp_path / "own.yaml"
@@ -478,7 +485,7 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
 
 def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(root)
-    monkeypatch.setattr("reskin.universal.frames.find_departure", lambda *_: None)
+    monkeypatch.setattr("pipeline.fitting.frames.find_departure", lambda *_: None)
     output_of(["new", "mine", "--boards", "b1,b2", "--presses", "20", "--passes", "2"])
     rng = rng_for(0, "passes")
     places_mm = np.concatenate([rng.permutation([[i, i % 5] for i in range(20)]) for _ in range(2)])

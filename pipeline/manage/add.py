@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from pipeline import PARAMS, PLAN, SCENES
 from pipeline.catalogue import EXPERIMENTS
@@ -39,6 +40,8 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
+# Places of this number or more are in another unit than mm if their span is this fraction of that of the chips.
+PLACES_MIN_N, SPAN_MIN = 9, 0.2
 COMPARED_N = 3  # the places of a new capture are compared with those of this number of the scene's latest captures
 
 
@@ -220,17 +223,32 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
 def _warn_of_departures(folder: Path, settings: Settings, policy: FaultPolicy) -> None:
     """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
     # imported here, because importing the physics takes seconds
+    from pipeline.fitting.frames import find_departure
     from pipeline.training.recorded import Compare
-    from reskin.universal.frames import find_departure
 
-    _, blocks, _ = open_capture(folder, policy)
+    blocks = list(open_capture(folder, policy)[1])
     section = settings.section(Compare, "compare")
     try:
-        sentence = find_departure(list(blocks), section.axes)
+        place_mm = np.concatenate([np.column_stack([each.x_mm, each.y_mm]) for each in blocks]).astype(float)
+        sentence = _other_unit(place_mm, section.layout.chips_mm) or find_departure(blocks, section.axes)
     except ReskinError as error:
         sentence = f"The orientation of labels, chips and skin was not compared with the scene's settings: {error}"
     if sentence:
         say(f"warning: capture {folder.name}: {sentence} The recording was added anyway.")
+
+
+def _other_unit(place_mm: Float64[np.ndarray, "m 2"], chips_mm: Float64[np.ndarray, "k 2"]) -> str:
+    """Return a sentence if the places span too little or too much for the board, as in cm or m; otherwise empty."""
+    place_mm = np.unique(place_mm[np.isfinite(place_mm).all(axis=1)].round(3), axis=0)
+    if len(place_mm) < PLACES_MIN_N:
+        return ""
+    span_mm, chips_span_mm = (float(np.ptp(places, axis=0).max()) for places in (place_mm, chips_mm))
+    if SPAN_MIN * chips_span_mm <= span_mm <= chips_span_mm / SPAN_MIN**2:
+        return ""
+    return (
+        f"The {len(place_mm)} places span {span_mm:.3g} mm, but the chips of the layout span {chips_span_mm:.3g} mm. "
+        "Probably the unit of the places is not mm: convert them to mm."
+    )
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from reskin.board.wire import Wire
+from reskin.board.custom import CustomWire, read_wire
 from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout, preparing
 from reskin.recordings.preparing import CaptureNames, Prepared
@@ -14,7 +14,7 @@ SERIAL = ("serial-binary", "serial-text")
 NATIVE = ("capture", *SERIAL)
 LAYOUTS_OF = {
     "probe": NATIVE, "mark": NATIVE, "chips": SERIAL, "rate_hz": SERIAL, "wire": SERIAL, "rows_late": ("ini",),
-    "force_axis": ("eflesh",), "pad": ("leaphand",),
+    "force_axis": ("eflesh",), "pad": ("leaphand",), "columns": ("table",),
 }  # fmt: skip
 
 
@@ -26,10 +26,11 @@ class Options:
     mark: list[str] | None = None
     chips: int | None = None
     rate_hz: float | None = None
-    wire: Wire | None = None
+    wire: str | None = None
     rows_late: int | None = None
     force_axis: str | None = None
     pad: int | None = None
+    columns: Path | None = None
 
     def check(self, layout: Layout) -> None:
         """Raise `ParamsError` if an option is given that the layout does not use."""
@@ -46,10 +47,13 @@ class Options:
         if layout == "capture":
             return preparing.native(recording, names, self.probe, marks)
         if layout == "serial-binary" or layout == "serial-text":
-            default: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
+            wire = read_wire(self.wire or ("binary" if layout == "serial-binary" else "text-xyzt"))
+            chips_n = wire.chips_n if isinstance(wire, CustomWire) else self.chips or 5
             rate_hz = 400.0 if self.rate_hz is None else self.rate_hz
-            dump = preparing.Dump(self.wire or default, self.chips or 5, rate_hz, self.probe, marks)
+            dump = preparing.Dump(wire, chips_n, rate_hz, self.probe, marks)
             return preparing.dump(recording, names, dump)
+        if self.columns is not None:
+            return preparing.mapped(recording, names, self.columns)
         given = {"rows_late": self.rows_late, "pad": self.pad}
         options = {name: str(value) for name, value in given.items() if value is not None}
         if layout == "eflesh":

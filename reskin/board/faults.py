@@ -19,6 +19,16 @@ FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
 FAILED_TOLERANCE = 0.01  # a reading counts as failed if it differs by less, because text formats round to two decimals
 
+# If no chip answers on the bus, all bytes are 0xFF, which is -1 step on each axis. A step along z is 1.61 times as
+# large as one along x and y (data sheet of the MLX90393, table 17), or equal in other chips.
+STEP_MAX_uT, STEP_RATIO, STEP_RATIO_OFF = 10.0, 1.3, 0.35
+EXTREME_MIN_uT = 4_000.0  # a field of this size is never exactly equal on three axes
+# A single reading is a jump if it differs from both of its neighbours by more than this, and by more than this multiple
+# of the median change between readings, and if the neighbours differ from each other by a small part of that.
+JUMP_MIN_uT, JUMP_STEPS, JUMP_AGREE, JUMP_READINGS_MIN_N = 60.0, 15.0, 0.25, 20
+RANGE_END = 0.999  # fields beyond this fraction of 2^15 steps are at the end of the range
+RANGE_MARGIN = 1.05  # a field beyond 2^15 steps by this factor is impossible
+
 # The LSB of a chip is the step between neighbouring values that the chip can send. These are the LSBs of a chip with
 # its power-on settings, found in AFG_test_new_board15 and piezo, two public recordings of layout `ini`.
 RESET_LSB_XY_uT = 0.98
@@ -80,14 +90,59 @@ GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of about this 
 def failed_reads(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
 ) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings that the firmware sends for a chip whose I2C read failed.
+    """Mark the readings that firmware sends for a chip whose I2C read failed.
 
-    Such a reading has the field `FAILED_B_uT` and the temperature `FAILED_TEMPERATURE_degC`. If the temperature is
-    unknown (NaN), only the field is compared.
+    There are three kinds: the field `FAILED_B_uT` and the temperature `FAILED_TEMPERATURE_degC` of the ReSkin firmware
+    (if the temperature is unknown, only the field is compared); bytes 0xFF in place of an answer, which are -1 step on
+    all axes; and the same extreme value on all axes.
     """
-    same_b = np.abs(_by_chip(b_uT) - FAILED_B_uT) <= FAILED_TOLERANCE
+    chips = _by_chip(b_uT)
+    same_b = np.abs(chips - FAILED_B_uT) <= FAILED_TOLERANCE
     same_temperature = np.abs(temperature_degC - FAILED_TEMPERATURE_degC) <= FAILED_TOLERANCE
-    return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
+    of_firmware = same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
+    x_uT, y_uT, z_uT = np.moveaxis(chips, 2, 0)
+    equal = np.abs(x_uT - y_uT) <= FAILED_TOLERANCE
+    with np.errstate(invalid="ignore", divide="ignore"):
+        steeper = z_uT / x_uT
+    no_answer = equal & (x_uT < 0) & (x_uT >= -STEP_MAX_uT) & (np.abs(steeper - STEP_RATIO) <= STEP_RATIO_OFF)
+    extreme = equal & (np.abs(x_uT - z_uT) <= FAILED_TOLERANCE) & (np.abs(x_uT) >= EXTREME_MIN_uT)
+    return np.asarray(of_firmware | no_answer | extreme)
+
+
+def impossible_reads(b_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings that a chip cannot send with its LSB, because a field needs more than 16 bits.
+
+    Such numbers come from torn lines of text. Chips with an unknown LSB (NaN) are not marked.
+    """
+    return np.asarray((np.abs(_by_chip(b_uT)) > RANGE_MARGIN * INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]).any(axis=2))
+
+
+def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
+    """Mark single readings far from both the reading before and the one after it, which agree.
+
+    No press is that short. Such readings come from lines whose digits were cut. The first and the last reading are
+    compared with their next two.
+    """
+    if len(b_uT) < JUMP_READINGS_MIN_N:
+        return np.zeros((len(b_uT), b_uT.shape[1] // 3), bool)
+    b_uT = b_uT.astype(np.float64)
+    steps_uT = np.abs(np.diff(b_uT, axis=0))
+    far_uT = np.maximum(JUMP_MIN_uT, JUMP_STEPS * np.median(steps_uT, axis=0))
+    padded = np.concatenate([b_uT[2:3], b_uT, b_uT[-3:-2]])
+    before, here, after = padded[:-2], padded[1:-1], padded[2:]
+    agree = np.abs(after - before) <= JUMP_AGREE * np.minimum(np.abs(here - before), np.abs(here - after))
+    jumps = (np.abs(here - before) > far_uT) & (np.abs(here - after) > far_uT) & agree
+    return np.asarray(_by_chip(jumps).any(axis=2))
+
+
+def at_range_end(b_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
+    """Mark the readings with a field at the end of the range of 16 bits, where values are clipped."""
+    return np.asarray((np.abs(_by_chip(b_uT)) > RANGE_END * INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]).any(axis=2))
+
+
+def is_frozen(b_uT: Float[np.ndarray, "f ch"]) -> bool:
+    """Return whether a whole board never changes, as if a library that was not started repeats one value for ever."""
+    return len(b_uT) >= STUCK_FRAMES_MIN_N and bool((b_uT == b_uT[0]).all())
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
@@ -337,10 +392,17 @@ class ReadingFaults(NamedTuple):
         return np.asarray((self.failed_read | self.zeros | self.too_hot | self.saturated).any(axis=1))
 
 
-def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
-    """Mark the faults that can be detected from a single reading."""
-    failed = failed_reads(b_uT, temperature_degC)
-    return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
+def find_reading_faults(
+    b_uT: Float[np.ndarray, "f ch"],
+    temperature_degC: Float[np.ndarray, "f k"],
+    lsb_uT: Float[np.ndarray, "k 2"] | None = None,
+) -> ReadingFaults:
+    """Mark the faults that can be detected from a single reading, and from the LSB of each chip if it is known."""
+    failed, clipped = failed_reads(b_uT, temperature_degC), saturated(b_uT)
+    if lsb_uT is not None:
+        failed |= impossible_reads(b_uT, lsb_uT)
+        clipped |= at_range_end(b_uT, lsb_uT)
+    return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, clipped & ~failed)
 
 
 class ScaleWindow(NamedTuple):
@@ -413,11 +475,17 @@ class FaultDetector:
         # the last frame's time of arrival, its time on the board's clock, and its last byte's position in the stream
         self._last: tuple[float, float, int] | None = None
 
+    def of_readings(self, frames: Frames) -> ReadingFaults:
+        """Mark the faults of single readings, with the LSB of the chips as far as it is known."""
+        return find_reading_faults(frames.b_uT, frames.temperature_degC, self._lsb_uT)
+
     def feed(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Faults:
         """Process the next frames and their times in s; return their faults."""
         b_uT, chips_n = frames.b_uT, frames.temperature_degC.shape[1]
-        readings = find_reading_faults(b_uT, frames.temperature_degC)
-        read = np.isfinite(b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1) & ~readings.failed_rows
+        readings = self.of_readings(frames)
+        temperatures = np.isfinite(frames.temperature_degC)  # a board may send none
+        complete = temperatures.all(axis=1) | ~temperatures.any(axis=1)
+        read = np.isfinite(b_uT).all(axis=1) & complete & ~readings.failed_rows
         sound = ~readings.faulty_rows
         scale = self._find_scale(b_uT[read], t_s[read])
         stuck, int16_wrap = np.zeros((2, len(frames), chips_n), bool)

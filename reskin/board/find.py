@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from reskin.board import faults, rates
+from reskin.board.custom import AnyWire, CustomWire
 from reskin.board.port import open_port, port_names, read_waiting
 from reskin.board.rates import RateMeasurement
-from reskin.board.stream import decode_all, matching_formats
-from reskin.board.wire import Wire
+from reskin.board.stream import FrameStream, decode_all, describe_unknown, matching_formats
 from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import CONVERSION_S, GAINS, steps_uT
 
@@ -36,7 +36,7 @@ class DetectedBoard(NamedTuple):
 
     port: str
     problem: str | None  # why no board was detected; None if there is a board
-    wire: Wire = "binary"
+    wire: AnyWire = "binary"
     chips_n: int = 0
     rate_hz: float = np.nan
     lsb_uT: tuple[float, float] = (np.nan, np.nan)  # LSB along x and y, and LSB along z; each is the median over chips
@@ -84,19 +84,22 @@ class DetectedBoard(NamedTuple):
         ])  # fmt: skip
 
 
-def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
+def scan_ports(
+    names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S, wire: CustomWire | None = None
+) -> list[DetectedBoard]:
     """Listen to several ports at the same time, and return what was detected on each.
 
-    `names` are the names of the ports. By default, these are all ports of this machine.
+    `names` are the names of the ports. By default, these are all ports of this machine. `wire` is the format of the
+    boards, if it is none of those that can be detected.
     """
     names = port_names() if names is None else names
     with ThreadPoolExecutor(max(len(names), 1)) as pool:
-        return list(pool.map(lambda name: detect_board(name, listening_s), names))
+        return list(pool.map(lambda name: detect_board(name, listening_s, wire), names))
 
 
-def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
+def find_board(names: Sequence[str] | None = None, wire: CustomWire | None = None) -> DetectedBoard:
     """Return the board that is connected; raise `CaptureError` if there is none, or more than one."""
-    boards = find_boards(names)
+    boards = find_boards(names, wire)
     if len(boards) != 1:
         raise CaptureError(
             f"{len(boards)} boards are connected: {'; '.join(map(str, boards))}. Choose one with --port."
@@ -104,9 +107,9 @@ def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
     return boards[0]
 
 
-def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
+def find_boards(names: Sequence[str] | None = None, wire: CustomWire | None = None) -> list[DetectedBoard]:
     """Return all boards that are connected; raise `CaptureError` if there are none."""
-    results = scan_ports(names)
+    results = scan_ports(names, wire=wire)
     boards = [board for board in results if board.problem is None]
     if not boards:
         problems = "; ".join(map(str, results)) or "no serial port found"
@@ -117,7 +120,7 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     return boards
 
 
-def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
+def detect_board(port: str, listening_s: float = LISTENING_S, wire: CustomWire | None = None) -> DetectedBoard:
     """Listen to a port for `listening_s`, and detect the board on it."""
     chunks: list[Chunk] = []
     try:
@@ -130,24 +133,28 @@ def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
         return DetectedBoard(port, str(error).removeprefix(f"{port}: "))
     except OSError as error:
         return DetectedBoard(port, f"the port disappeared while it was read: {error}")
-    return recognise(port, chunks)
+    return recognise(port, chunks, wire)
 
 
-def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
-    """Detect a board from the chunks of bytes that its port sent."""
+def recognise(port: str, chunks: Sequence[Chunk], wire: CustomWire | None = None) -> DetectedBoard:
+    """Detect a board from the chunks of bytes that its port sent; `wire` is its format, if the user has stated it."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
         return DetectedBoard(port, "no bytes arrived. Check that the board is running")
-    formats = matching_formats(data)
+    formats: Sequence[tuple[AnyWire, int]] = matching_formats(data)
+    if wire is not None:
+        stream = FrameStream(wire, wire.chips_n)
+        stream.feed(data)
+        if not stream.account()["frames_n"]:
+            return DetectedBoard(port, f"no frame of the stated format in {len(data)} bytes ({wire})")
+        formats = [(wire, wire.chips_n)]
     if not formats:
-        return DetectedBoard(
-            port, f"no frame in {len(data)} bytes, so the baud rate is wrong or the device is not a board"
-        )
-    decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
+        return DetectedBoard(port, f"no frame in {len(data)} bytes. The bytes are {describe_unknown(data)}")
+    decoded = [(*decode_all(data, form, chips_n, port), form, chips_n) for form, chips_n in formats]
     # The bytes of a text frame fit both text formats, which differ only in the order of the numbers: a chip's
     # temperature is its first number in one format, and its last number in the other. Temperatures vary less than
     # fields, so choose the format in which the decoded temperatures vary least.
-    frames, account, wire, chips_n = min(
+    frames, account, found, chips_n = min(
         decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64))
     )
     # Bytes that are not a board's may be decoded to very large numbers, whose differences overflow.
@@ -155,7 +162,7 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
     rate = rates.measure(frames, chunks)
     frame_bytes_n = account["frame_bytes_n"] / len(frames)
-    return DetectedBoard(port, None, wire, chips_n, rate.arrived_hz, (lsb_uT[0], lsb_uT[1]), rate, frame_bytes_n)
+    return DetectedBoard(port, None, found, chips_n, rate.arrived_hz, (lsb_uT[0], lsb_uT[1]), rate, frame_bytes_n)
 
 
 def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from reskin.board import wire as wires
+from reskin.board.custom import AnyWire, CustomWire
 from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run, Wire
 from reskin.errors import CaptureError
 
@@ -30,6 +31,14 @@ ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipp
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
 VALUE_MIN = 1e-3  # in uT or degC; a value that is smaller but not 0 is implausible, because it is below the LSB
+
+HEAD_BYTES_N = 16384  # the format is found from this number of bytes
+EXPLAINED_MIN = 0.8  # share of the bytes that the frames of a format must contain, so that it is accepted
+PLAUSIBLE_MIN = 0.3  # share of the chips' readings that must be plausible in a binary format: some chips may be broken
+PRINTABLE = bytes([9, 10, 13, *range(32, 127)])
+ENDS_MAX = 1.5  # largest number of CR LF per frame in a binary format; more of them end other frames
+TEXT_SHARE_MIN = 0.98  # at least this share of the bytes of readable text is printable
+PERIOD_MAX_N, PERIOD_GAIN_MIN = 1100, 0.04  # longest period of unknown frames, and by how much it must stand out
 
 SEARCH_FRAMES_N = 64  # the search for the next frame looks at the bytes of this many frames at once
 
@@ -54,9 +63,8 @@ class FrameStream:
     stream begins in the middle of a frame's first number, this number is decoded wrongly.
     """
 
-    def __init__(self, wire: Wire, chips_n: int) -> None:
+    def __init__(self, wire: AnyWire, chips_n: int) -> None:
         self._wire, self._chips_n = wire, chips_n
-        self._scan = _scan_lines if wire in wires.TEXT_WIRES else _scan_binary
         self._rest = b""
         self._at_boundary = True
         self._closed = False
@@ -83,7 +91,7 @@ class FrameStream:
         """Scan the undecided bytes and `data` for frames; if `final`, no more bytes follow."""
         buffer = self._rest + data if self._rest else data
         offset = self._count["bytes_n"] - len(self._rest)
-        scan = self._scan(np.frombuffer(buffer, np.uint8), self._at_boundary, final, self._wire, self._chips_n)
+        scan = _scan(np.frombuffer(buffer, np.uint8), self._at_boundary, final, self._wire, self._chips_n)
         self._rest, self._at_boundary = (b"" if final else buffer[scan.settled_n :]), scan.at_boundary
         self._count.update(scan.count, bytes_n=len(data), frames_n=len(scan.frames))
         accounted_n = scan.count["frame_bytes_n"] + scan.count["skipped_not_finite_bytes_n"]
@@ -92,7 +100,7 @@ class FrameStream:
         return replace(scan.frames, end_byte=scan.frames.end_byte + offset)
 
 
-def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frames, dict[str, int]]:
+def decode_all(data: bytes, wire: AnyWire, chips_n: int, where: str) -> tuple[Frames, dict[str, int]]:
     """Decode a whole stream; raise `CaptureError` if it contains no frame."""
     stream = FrameStream(wire, chips_n)
     frames = wires.concatenate([part for part in (stream.feed(data), stream.close()) if len(part)], chips_n)
@@ -101,37 +109,101 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
     return frames, stream.account()
 
 
-def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
+def no_frame(where: str, data: bytes, wire: AnyWire, chips_n: int) -> CaptureError:
     """Return the error for a stream without frames.
 
-    The message suggests those formats in which `data`, the first bytes of the stream, can be decoded.
+    The message suggests those formats in which `data`, the first bytes of the stream, can be decoded. If there is none,
+    it describes the bytes.
     """
-    hint = " or ".join(f"{fit} with {k} chips" for fit, k in matching_formats(data))
-    remedy = "Check the baud rate, the number of chips and the wire format." + (
-        f" The bytes fit {hint}." if hint else ""
-    )
     if not data:
         remedy = "Check that the board is running and sends data."
+    elif formats := matching_formats(data):
+        hint = " or ".join(f"{fit} with {k} chips" for fit, k in formats)
+        remedy = f"Check the baud rate, the number of chips and the wire format. The bytes fit {hint}."
+    else:
+        remedy = f"The bytes are {describe_unknown(data)}"
     return CaptureError(
         f"{where}: no frame found in {len(data)} bytes, read as {chips_n} chips in wire format {wire}. {remedy}"
     )
 
 
 def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats in which most of the first 16 KiB of `data` can be decoded into frames.
+    """List the formats that explain the first 16 KiB of `data`.
 
-    A format is a pair of a wire format and a number of chips. If formats with different numbers of chips fit, only
-    those with the smallest number of chips are listed.
+    A format is a pair of a wire format and a number of chips. It explains the bytes if at least the share
+    `EXPLAINED_MIN` of them are frames, apart from an incomplete frame at each end. Only text formats are tried for
+    readable text; the values of binary formats must be plausible, because any bytes can be read as numbers. If formats
+    with different numbers of chips fit, only those with the smallest number of chips are listed.
     """
-    data = data[:16384]
+    data = data[:HEAD_BYTES_N]
+    text = is_text(data)
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
-        streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
-        for stream in streams.values():
-            stream.feed(data)
-        matches = [wire for wire, stream in streams.items() if 2 * stream.account()["frame_bytes_n"] > len(data)]
+        matches = []
+        for wire in get_args(Wire):
+            if text == (wire in wires.TEXT_WIRES):
+                stream = FrameStream(wire, chips_n)
+                frames, account = stream.feed(data), stream.account()
+                ends_n = 2 * account["frame_bytes_n"] / max(account["frames_n"], 1)  # as long as two frames
+                enough = account["frame_bytes_n"] >= EXPLAINED_MIN * (len(data) - ends_n)
+                # In other formats of ends with CR LF, several of their frames may look like one of these.
+                single = text or data.count(b"\r\n") <= ENDS_MAX * account["frames_n"] + 2
+                if len(frames) and enough and single and (text or _are_plausible(frames)):
+                    matches.append((wire, chips_n))
         if matches:
-            return [(wire, chips_n) for wire in matches]
+            return matches
     return []
+
+
+def is_text(data: bytes) -> bool:
+    """Return whether bytes are readable text: nearly all are printable ASCII characters, tabs or ends of lines."""
+    return len(data) > 0 and len(data.translate(None, PRINTABLE)) <= (1 - TEXT_SHARE_MIN) * len(data)
+
+
+def describe_unknown(data: bytes) -> str:
+    """Describe bytes that are in no known format, and state what the user can do."""
+    data = data[:HEAD_BYTES_N]
+    if is_text(data):
+        lines = [line.strip() for line in data.decode("ascii", "replace").splitlines()[1:-1] if line.strip()]
+        line = max(lines, key=lines.count) if lines else data[:80].decode("ascii", "replace")
+        numbers_n = len(re.findall(r"(?<![A-Za-z\d])[-+]?\d+(?:\.\d*)?", line))
+        return (
+            f"readable text, but no known format: {line[:80]!r}, {numbers_n} numbers a line. Known lines have four "
+            "numbers with two decimals for each chip, separated by tabs: X Y Z T (text-xyzt) or T X Y Z (text-txyz). "
+            "Describe other lines with --wire text:Bx0,By0,Bz0,... (docs/live.md, Other firmware)."
+        )
+    period_n = _period_n(np.frombuffer(data, np.uint8))
+    repeats = f" They repeat every {period_n} bytes." if period_n else ""
+    return (
+        f"no known frames.{repeats} Check the baud rate. A known binary frame has the temperature and three fields of "
+        "each chip as float32, and ends with CR LF; describe other frames in a file for "
+        "--wire (docs/live.md, Other firmware)."
+    )
+
+
+def _period_n(octets: UInt8[np.ndarray, " bytes"]) -> int | None:
+    """Return the length after which bytes repeat most often, if this is clearly more often than by chance."""
+    longest_n = min(PERIOD_MAX_N, len(octets) // 4)
+    shares = np.array([0.0, *((octets[n:] == octets[:-n]).mean() for n in range(1, longest_n + 1))])
+    gain = shares - np.median(shares)
+    best = int(np.argmax(gain >= 0.8 * gain.max()))  # the shortest of its multiples
+    return best if best >= 4 and gain[best] > PERIOD_GAIN_MIN else None
+
+
+def _are_plausible(frames: Frames) -> bool:
+    """Return whether most chips have plausible values in most frames."""
+    chips_n = frames.temperature_degC.shape[1]
+    b_uT = frames.b_uT.reshape(len(frames), chips_n, 3)
+    txyz = np.concatenate([frames.temperature_degC[..., None], b_uT], axis=2)
+    return bool(_plausible(txyz).mean() >= PLAUSIBLE_MIN)
+
+
+def _scan(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: AnyWire, chips_n: int) -> _Scan:
+    """Find and decode the frames in a buffer of bytes, in any format."""
+    if isinstance(wire, CustomWire):
+        frames, count, settled_n = wire.scan(octets, final=final)
+        return _Scan(frames, count, settled_n, at_boundary=True)
+    scan = _scan_lines if wire in wires.TEXT_WIRES else _scan_binary
+    return scan(octets, at_boundary, final, wire, chips_n)
 
 
 def _scan_binary(

@@ -23,7 +23,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from reskin import io
-from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
+from reskin.board.custom import CustomWire
+from reskin.board.faults import (
+    INT16_STEPS_N,
+    FAILED_B_uT,
+    FAILED_TEMPERATURE_degC,
+    RESET_LSB_XY_uT,
+    RESET_LSB_Z_uT,
+    find_lsb,
+)
 from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
@@ -38,6 +46,7 @@ from reskin.simulation.defaults import SHARED, nominal
 from reskin.simulation.protocols import LIFTED_MM, Plan, Walk
 from reskin.simulation.settings import MAIN, parse_simulation
 
+UNKNOWN_degC = 25.0  # is sent as the temperature of boards that send none
 NOMINAL_SOURCE = "nominal"
 SEED = 2021  # seed of a simulation, if the scene's YAML file does not set a seed
 TOUCH_PROTOCOL = "log"  # name of the protocol with touches and pauses between them, similar to a user's touches
@@ -56,8 +65,8 @@ START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
 # Fault `crlf`: as a float32, this temperature contains the bytes 0D 0A, which also mark the end of a frame.
 CRLF_TEMPERATURE_degC = 34.513275
-FULL_SCALE_uT = 50_000.0  # largest field that a chip can measure
-WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolution, which is 0.15 uT per step
+FINEST_LSB_uT = (0.15, 0.242)  # along x and y, and along z; assumed if the LSB of a chip cannot be detected
+NEAR_END = 0.98  # fraction of the range at which fields of fault int16-wrap alternate
 MAGNET_uT = 400.0  # fault `magnet`: change of the field along z
 HOT_degC = 150.0  # fault `too-hot`: temperature
 CLOCK_JUMP_S = 3600.0  # fault `clock-jump`: change of the time
@@ -156,6 +165,9 @@ def read_capture(folder: Path) -> Script:
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
+    if isinstance(header.wire, CustomWire):  # emulated as a board that sends the paper's format
+        temperature_degC = np.nan_to_num(frames.temperature_degC, nan=UNKNOWN_degC)
+        return _binary_script(header.source, frames.b_uT, temperature_degC, t_s)
     edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames become part of the second frame's piece
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
@@ -297,7 +309,7 @@ def inject(script: Script, fault: Fault) -> Script:
         return replace(script, t_s=later_s, unplugged_s=unplugged_s)
     if fault.name in VALUE_FAULTS:
         frames = script.frames.where(inside)
-        _change_values(frames, fault.name)
+        _change_values(frames, fault.name, find_lsb(script.frames.b_uT))
         changed = encode_pieces(frames, script.wire)
     else:
         changed = _change_bytes([script.pieces[i] for i in rows], fault.name)
@@ -307,10 +319,11 @@ def inject(script: Script, fault: Fault) -> Script:
     return replace(script, pieces=pieces)
 
 
-def _change_values(frames: Frames, fault: str) -> None:
+def _change_values(frames: Frames, fault: str, lsb_uT: Float64[np.ndarray, "k 2"]) -> None:
     """Change the values in the given frames as a fault would change them. The frames are changed in place."""
     b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
     chip_i = min(1, temperature_degC.shape[1] - 1)
+    end_uT = INT16_STEPS_N * np.where(np.isfinite(lsb_uT[chip_i]), lsb_uT[chip_i], FINEST_LSB_uT)[[0, 0, 1]]
     match fault:
         case "failed-read":
             b_uT[:, chip_i], temperature_degC[:, chip_i] = FAILED_B_uT, FAILED_TEMPERATURE_degC
@@ -326,9 +339,10 @@ def _change_values(frames: Frames, fault: str) -> None:
             read_i = np.maximum(frame_i - (frame_i - all_i) % SLOW_FRAMES_N, 0)
             b_uT[:], temperature_degC[:] = b_uT[read_i, all_i], temperature_degC[read_i, all_i]
         case "saturated":
-            b_uT[:, chip_i] = FULL_SCALE_uT * np.sign(b_uT[:, chip_i])
+            b_uT[:, chip_i] = end_uT * np.sign(b_uT[:, chip_i])
         case "int16-wrap":
-            b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
+            b_uT[::2, chip_i, 2] = NEAR_END * end_uT[2]
+            b_uT[1::2, chip_i, 2] = -NEAR_END * end_uT[2]
         case "magnet":
             # All chips measure the same change of Bz, because chips are rotated only about z.
             b_uT[:, :, 2] += MAGNET_uT

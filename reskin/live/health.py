@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading_faults
+from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults
 from reskin.board.rates import REPEATED_MAX, RepeatCounter
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
@@ -104,7 +104,7 @@ class Health:
         a single reading are detected immediately. Faults that are visible only in several frames are detected once per
         `BATCH_FRAMES_N` frames.
         """
-        readings = find_reading_faults(frames.b_uT, frames.temperature_degC)
+        readings = self._detector.of_readings(frames)
         faulty = self._note_chips("failed I2C reads", readings.failed_read, now_s, "failed_read")
         faulty |= self._note_chips("zeros in place of a reading", readings.zeros, now_s, "zeros")
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")

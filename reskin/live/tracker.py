@@ -11,7 +11,7 @@ For a `LiveSkin`, the bytes are decoded and the contacts are estimated in the co
 import threading
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from copy import copy
@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from reskin.board import find
+from reskin.board.custom import CustomWire
 from reskin.board.faults import GARBAGE_FRAMES_N
 from reskin.board.find import Chunk
 from reskin.board.port import check_name
@@ -45,8 +47,7 @@ from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.universal.calibration import check_presses
 from reskin.universal.layout import BoardLayout
-from reskin.universal.map import Estimate
-from reskin.universal.model import MISFIT_MAX, Universal
+from reskin.universal.model import MISFIT_MAX, Estimate, Universal
 
 NOLOAD_S = 1.0  # the no-load reading is the mean of the readings in this time, during which nothing touches the skin
 NOLOAD_FRAMES_MAX_N = 10_000  # the no-load reading ends earlier if this number of frames has arrived
@@ -131,6 +132,7 @@ class LearningState(NamedTuple):
     guided: Labels  # presses at places that the page showed
     typed: Labels  # presses whose places the user entered
     step: str  # description of the calibration step, such as "the 12 presses"
+    refined: Mapping[str, np.ndarray] = MappingProxyType({})  # weights of the network, if it was refined on the page
 
     @property
     def labels(self) -> Labels:
@@ -188,11 +190,7 @@ class UniversalEstimator:
         return self._model.suppressor(noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Set the no-load field to the mean of f readings without contact, and repeat the calibration.
-
-        The calibration depends on the no-load field, which also shows whether the skin is turned by 90 degrees (see
-        `Universal.mounting`).
-        """
+        """Set the no-load field to the mean of f readings without contact, and repeat the calibration with it."""
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._use(self.learnt)
 
@@ -201,7 +199,7 @@ class UniversalEstimator:
 
         Returns
         -------
-        A text for the user: the standard deviation of places and the misfit, before and after the calibration.
+        A text for the user: the standard deviation of places, before and after the calibration.
 
         Raises
         ------
@@ -214,10 +212,9 @@ class UniversalEstimator:
         self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=step))
         after = self._estimate(db_uT)
         sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
-        misfit = [np.median(estimate.misfit) for estimate in (before, after)]
         return (
             f"adapted to {len(db_uT)} presses: median standard deviation of the places {sd_mm[0]:.2f} mm before, "
-            f"{sd_mm[1]:.2f} mm after; median misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
+            f"{sd_mm[1]:.2f} mm after"
         )
 
     def label(
@@ -225,7 +222,7 @@ class UniversalEstimator:
     ) -> str:
         """Calibrate to presses at known places, except for presses that are held out to measure the error.
 
-        The forces of the presses were not measured. The model's own estimates are used in place of measured forces.
+        The forces of the presses were not measured.
 
         Returns
         -------
@@ -274,6 +271,19 @@ class UniversalEstimator:
         forces = "" if np.isnan(force_N) else f", force {before.force_N[0]:.2f} N instead of {force_N:.2f} N"
         return f"calibrated to a labelled press; before, the error of its place was {error_mm:.2f} mm{forces}"
 
+    def refine(self) -> str:
+        """Train the network further on the labelled presses (see `Universal.refine`); return a text for the user.
+
+        Raises
+        ------
+        SchemaError
+            If there are too few labels with known forces. The calibration is then unchanged.
+        """
+        refined = copy(self._model).refine()
+        data = refined.skin.data
+        self._learn(self.learnt._replace(refined=data.refined, step="refinement of the network"))
+        return f"refined the network on {len(data.labels)} labelled presses; button Undo reverts it"
+
     def load(self, file: Path) -> str:
         """Replace all calibration data by a saved calibration; return a text for the user.
 
@@ -298,10 +308,10 @@ class UniversalEstimator:
         return f"undone: {step}"
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
-        estimate = self._estimate(db_uT)
+        b_uT = db_uT + self._noload_uT
+        estimate, misfit = self._model.estimate(b_uT), self._model.misfit(b_uT)
         target = np.column_stack([estimate.place_mm, estimate.force_N])
-        sd_F_N = estimate.force_N * estimate.sd_log_N  # to first order
-        return Prediction(target, estimate.sd_mm, sd_F_N, np.asarray(estimate.misfit > MISFIT_MAX))
+        return Prediction(target, estimate.sd_mm, estimate.sd_N, np.asarray(misfit > MISFIT_MAX))
 
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
         return self._model.estimate(db_uT + self._noload_uT)
@@ -319,13 +329,10 @@ class UniversalEstimator:
         if len(state.presses_uT):
             model.see(state.presses_uT + self._noload_uT)
         place_mm, force_N, db_uT = state.labels
-        known = np.isfinite(force_N)
-        if known.any():
-            model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
-        # Presses with unknown forces are added last, because the presses with known forces help to estimate their
-        # forces.
-        if not known.all():
-            model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
+        if len(force_N):
+            model.label(place_mm, force_N, db_uT + self._noload_uT, keep=True)
+        if state.refined:
+            model.use_refined(state.refined)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so it is made before the first contact
         self._model, self.warnings = model, model.warnings
 
@@ -436,9 +443,10 @@ class LiveSkin:
     """
 
     def __init__(
-        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY
-    ) -> None:
-        self.port, self.fault_policy = port, fault_policy
+        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY,
+        wire: CustomWire | None = None,
+    ) -> None:  # fmt: skip
+        self.port, self.fault_policy, self.wire = port, fault_policy, wire
         self.detected = find.DetectedBoard(port, WAITING)
         self.description = port  # the port; after the wire format was detected, also the format and the scale
         self.account: Counter[str] = Counter()  # sums of the counts of all `FrameStream` objects since the start
@@ -587,7 +595,7 @@ class LiveSkin:
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
             return []
         chunks, self._head = self._head, []
-        detected = find.recognise(self.port, chunks)
+        detected = find.recognise(self.port, chunks, self.wire)
         if detected.problem:
             self.detected = detected
             return []

@@ -4,13 +4,14 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64
 
+from reskin.board.custom import AnyWire
 from reskin.board.stream import decode_all
-from reskin.board.wire import Wire, record_type
+from reskin.board.wire import record_type
 from reskin.errors import CaptureError
 from reskin.recordings import clocks
 
 
-def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
+def decode_dump(data: bytes, wire: AnyWire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
     """Decode a serial dump to a table, and count its bytes and frames; raise `CaptureError` if it has no frames.
 
     The unit of each column is in the metadata of its Arrow field.

@@ -20,6 +20,7 @@ from reskin.board.faults import (
     ReadingFaults,
     find_lsb,
     find_reading_faults,
+    is_frozen,
     stuck_chips,
     unusual_lsb,
 )
@@ -93,6 +94,20 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
             )
         changes[name] = action
     return policy.model_copy(update=changes)
+
+
+FROZEN = (
+    "every reading is the same, so the board or the library that reads it repeats one value. Check that the library is "
+    "started and that the chips answer, and record again."
+)
+
+
+def reading_faults_of_table(
+    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
+) -> ReadingFaults:
+    """Mark the faults of single readings of a whole table, from whose sound rows the LSB of the chips is found."""
+    sound = ~find_reading_faults(b_uT, temperature_degC).faulty_rows
+    return find_reading_faults(b_uT, temperature_degC, find_lsb(b_uT[sound]))
 
 
 @dataclass
@@ -304,7 +319,9 @@ def check_rows(
     """
     log = FaultLog(policy, where, "row")
     row = 1 + np.arange(len(b_uT)) if row is None else row
-    readings = find_reading_faults(b_uT, temperature_degC)
+    readings = reading_faults_of_table(b_uT, temperature_degC)
+    if is_frozen(b_uT[~readings.failed_rows]):
+        raise CaptureError(f"{where}: {FROZEN}")
     failed, out_of_range = log.record_readings(readings, row)
     read = ~readings.failed_rows
     if not read.any():

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from reskin import io
-from reskin.board.wire import Wire
+from reskin.board.custom import AnyWire
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout
 
@@ -92,7 +92,7 @@ class Header(_Frozen):
     skin: Name
     source: Source
     layout: Layout
-    wire: Wire | None
+    wire: AnyWire | None
     chips_n: Annotated[int, Field(ge=1, le=64)]
     unit_b: Literal["uT"]
     unit_force: Literal["N"]

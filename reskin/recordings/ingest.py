@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from reskin import io
+from reskin.board.custom import AnyWire, frame_bytes_of
 from reskin.board.faults import FaultDetector, find_reading_faults
 from reskin.board.stream import FrameStream, TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC, no_frame
-from reskin.board.wire import TEXT_WIRES, Frames, Wire, record_type
+from reskin.board.wire import TEXT_WIRES, Frames
 from reskin.errors import CaptureError
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals, ClockMap, from_contacts, from_marks
@@ -344,7 +345,7 @@ def _timed_frames(
     """Decode the stream in blocks; after the last block, add the counts of bytes, frames and faults to `account`."""
     wire, where = _wire(header), str(folder / STREAM_FILE)
     stream, log = FrameStream(wire, header.chips_n), FaultLog(policy, where, "ms")
-    frame_bytes_n = None if wire in TEXT_WIRES else record_type(wire, header.chips_n).itemsize
+    frame_bytes_n = frame_bytes_of(wire, header.chips_n)
     detector = FaultDetector(header.chips_n, frame_bytes_n=frame_bytes_n, expected_lsb_uT=header.expected_lsb_uT)
     frames_n, units_checked = 0, False
     with (folder / STREAM_FILE).open("rb") as file:
@@ -365,12 +366,13 @@ def _timed_frames(
     account.update(stream.account() | log.account())
 
 
-def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
+def _check_units(frames: Frames, wire: AnyWire, where: str) -> bool:
     """Raise if the fields of the fault-free frames are not in uT, or if the header states the wrong text format.
 
     Returns False if there are no fault-free frames, so that nothing was checked.
     """
-    read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
+    temperatures = np.isfinite(frames.temperature_degC)
+    read = np.isfinite(frames.b_uT).all(axis=1) & (temperatures.all(axis=1) | ~temperatures.any())
     read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
     if not read.any():
         return False
@@ -405,9 +407,8 @@ def timer(folder: Path, header: Header) -> Timer:
         raise CaptureError(
             folder, "clock.kind", "'arrivals' or 'rate', if a port was recorded", got, "Correct header.json."
         )
-    if header.wire in TEXT_WIRES:
+    if (frame_bytes_n := frame_bytes_of(_wire(header), header.chips_n)) is None:
         return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
-    frame_bytes_n = record_type(_wire(header), header.chips_n).itemsize
     return lambda frames, _: clocks.constant_rate(frames.end_byte / frame_bytes_n, rate_hz)
 
 
@@ -427,6 +428,6 @@ def _arrivals(folder: Path) -> Arrivals:
     return table
 
 
-def _wire(header: Header) -> Wire:
+def _wire(header: Header) -> AnyWire:
     assert header.wire is not None, "checked by `Header`: a native capture has a wire format"
     return header.wire

@@ -11,16 +11,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from reskin import io
 from reskin.board import stream
-from reskin.board.wire import TEXT_WIRES, Wire
+from reskin.board.custom import AnyWire
+from reskin.board.wire import TEXT_WIRES
 from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings import ReaderLayout
 from reskin.recordings import header as headers
 from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
-from reskin.recordings.readers import READERS
+from reskin.recordings.readers import READERS, table
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # name of the board and of the skin in a recording that was made without names
@@ -48,7 +52,7 @@ class Dump:
     `probe` is the probe log, and `marks` are sync marks (pairs of stream time and probe time of the same event).
     """
 
-    wire: Wire
+    wire: AnyWire
     chips_n: int
     rate_hz: float
     probe: Path | None
@@ -121,6 +125,22 @@ def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options:
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
     return _header(names, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
+
+
+def mapped(recording: Path, names: CaptureNames, map_file: Path) -> Prepared:
+    """Prepare a table with other columns or units, converted by a map; see `column_map`."""
+    from reskin.recordings import column_map  # needs pandas, which the library does without
+
+    _check_exists(recording)
+    columns = column_map.read_map(map_file)
+    converted = column_map.convert(recording, columns)
+    content = pa.BufferOutputStream()
+    pq.write_table(converted, content)
+    header = _header(names, recording, layout="table", chips_n=column_map.chips_of(converted), options={})
+    note = f"converted by reskin add from {recording.name} with {map_file.name}"
+    return header.model_copy(update={"note": note, "source": columns.source}), {
+        table.PARQUET: content.getvalue().to_pybytes()
+    }
 
 
 def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reskin import io
+from reskin.board.custom import AnyWire
 from reskin.board.rates import RateMeasurement
-from reskin.board.wire import Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, Clock, Header, Rate, Source, make_header, render, seal
 from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
@@ -106,7 +106,7 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
     return LabelContext(writer, unix_s, stop, mark)
 
 
-def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
+def begin_capture(folder: Path, info: CaptureInfo, *, wire: AnyWire, chips_n: int, by: str) -> tuple[Path, Header]:
     """Create the folder `<folder>.part` and its header; return the path of this folder, and the header.
 
     `by` is the name of the recording program, which becomes part of the note in the header.

@@ -18,10 +18,11 @@ from typing import Literal
 import numpy as np
 
 from reskin import io
+from reskin.board.custom import AnyWire, is_line
 from reskin.board.port import Device, found_ports, open_port, read_waiting
 from reskin.board.rates import RateMeasurement, RateMeter
 from reskin.board.stream import FrameStream, no_frame
-from reskin.board.wire import TEXT_WIRES, Frames, Wire
+from reskin.board.wire import Frames
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
@@ -40,7 +41,7 @@ class PortSettings:
     """The settings of a port, and the limits at which a recording ends."""
 
     baud: int
-    wire: Wire
+    wire: AnyWire
     chips_n: int
     duration_s: float  # the recording ends after this time; math.inf means no limit
     bytes_max_n: int | None  # the recording ends after this many bytes; None means no limit
@@ -92,12 +93,12 @@ class CaptureWriter:
     The written bytes are also decoded, to count the frames and to measure their rate.
     """
 
-    def __init__(self, folder: Path, wire: Wire, chips_n: int) -> None:
+    def __init__(self, folder: Path, wire: AnyWire, chips_n: int) -> None:
         self.bytes_n = self.partial_line_bytes_n = 0
         self.decoder = FrameStream(wire, chips_n)
         self._chips_n = chips_n
         self._meter: RateMeter | None = None  # None until the first bytes arrive
-        self._in_partial_line = wire in TEXT_WIRES
+        self._in_partial_line = is_line(wire)
         # The files are not buffered. Therefore, no written data is lost if the process is killed, and closing the files
         # cannot fail because of a full disk.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)

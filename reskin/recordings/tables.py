@@ -4,7 +4,9 @@
 that other recorders wrote.
 """
 
+import gzip
 import re
+import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 from jaxtyping import Bool, Float64, Int, Shaped
 
@@ -20,7 +23,13 @@ from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
 COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or correct it."
-SEMICOLONS = "line 1 contains semicolons. Export the file with commas between columns, and with decimal points."
+SEMICOLONS = (
+    "line 1 contains semicolons. Export the file with commas between columns, and with decimal points. Or describe the "
+    "file for option --columns of reskin add (docs/add-a-skin.md)."
+)
+NUMBER_PATTERN = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
+GZIP_MARK = b"\x1f\x8b"
+UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 FIRST_ROW = 2  # the first row with values; row 1 of the file has the column names
 # Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
 CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
@@ -58,6 +67,38 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         raise CaptureError(f"{where}: file not found. Copy the whole folder of the capture again.") from None
     _check_names(table.column_names, types, where)
     return table.select(list(types)).combine_chunks()
+
+
+def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> tuple[Float64[np.ndarray, "f c"], int]:
+    """Read a CSV file of numbers that a program wrote line by line, some of whose lines may be torn.
+
+    Returns the numbers, in which cells that are empty or are no numbers are NaN, and the number of lines that were left
+    out because they have too few or too many cells. Raises CaptureError if the file is not readable text.
+    """
+    torn_n = 0
+
+    def skip(_: Any) -> str:
+        nonlocal torn_n
+        torn_n += 1
+        return "skip"
+
+    text = pa.string()
+    try:
+        table = pacsv.read_csv(
+            path,
+            read_options=pacsv.ReadOptions(use_threads=False),
+            parse_options=pacsv.ParseOptions(invalid_row_handler=skip),
+            convert_options=pacsv.ConvertOptions(column_types=dict.fromkeys(names, text)),
+        ).select(list(names))
+    except (pa.ArrowInvalid, UnicodeDecodeError, KeyError) as error:
+        got = ascii(" ".join(str(error).split()))[1:-1][:200]
+        raise CaptureError(f"{where}: not a CSV file with columns {_list(list(names))}: {got}. {COPY_AGAIN}") from None
+    numbers = np.empty((len(table), len(names)))
+    for i, name in enumerate(names):
+        cells = pc.utf8_trim_whitespace(table.column(name))
+        is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
+        numbers[:, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
+    return numbers, torn_n
 
 
 def _column_names(source: str | Path) -> list[str]:
@@ -110,7 +151,7 @@ MAGNITUDE_MAX = 1e10
 
 
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into cells; return one list of cells per line.
+    """Split a text file into cells; return one list of cells per line. Tabs may take the place of commas.
 
     Raises `CaptureError` if the lines do not have the same number of cells. If `separator` is None, cells are separated
     by white space.
@@ -118,6 +159,9 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
         raise CaptureError(f"{where}: {SEMICOLONS}")
+    first = text.partition("\n")[0]
+    if separator == "," and "\t" in first and "," not in first:
+        separator = "\t"
     cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):
@@ -179,12 +223,7 @@ def _dtype(name: str) -> type[np.generic]:
 
 def _read_text(path: Path, where: str) -> str:
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a byte order mark
-    except UnicodeDecodeError as error:
-        byte = f"{error.object[error.start]:#04x} at position {error.start}"
-        raise CaptureError(
-            f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file."
-        ) from None
+        text = text_of(path.read_bytes(), where)
     except OSError as error:
         raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
     if not text.endswith("\n"):
@@ -195,6 +234,22 @@ def _read_text(path: Path, where: str) -> str:
             "recording again. If the last line is complete, add a line break after it."
         )
     return text
+
+
+def text_of(content: bytes, where: str) -> str:
+    """Decode a text file, which may be compressed (gzip); its byte order mark, if any, tells UTF-16 from UTF-8."""
+    try:
+        content = gzip.decompress(content) if content[:2] == GZIP_MARK else content
+    except (OSError, EOFError, zlib.error):
+        raise CaptureError(f"{where}: the gzip file is damaged. Copy the file again.") from None
+    try:
+        return content.decode("utf-16" if content[:2] in UTF16_MARKS else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        byte = f"{content[error.start]:#04x} at position {error.start}"
+        raise CaptureError(
+            f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file. If it "
+            "has a table in another container, docs/add-a-skin.md (option --columns) says which can be read."
+        ) from None
 
 
 def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> CaptureError:
@@ -235,7 +290,8 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
     if missing:
         raise CaptureError(
             f"{where}: no column {', '.join(missing)}. Check that the layout is {layout}, and that line 1 has the "
-            "column names. See data/README.md."
+            "column names. See data/README.md. If the values have other names or units, describe them in a file for "
+            "option --columns (docs/add-a-skin.md)."
         )
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:

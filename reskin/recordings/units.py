@@ -6,7 +6,7 @@ The checks raise `CaptureError` if the values are not plausible in these units, 
 import numpy as np
 from jaxtyping import Float
 
-from reskin.board import faults
+from reskin.board import chips, faults
 from reskin.errors import CaptureError
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.tables import FIRST_ROW
@@ -23,6 +23,8 @@ GAUSS_MAX = 200.0
 # If the steps between values are larger than this number, the values are in nT. The steps of the chip are 0.150 uT to
 # 9.68 uT, which are 150 or more in nT.
 NANO_STEP_MIN = 100.0
+# Whole numbers are raw counts if there are at least this many readings, and this share of the steps between them is 1.
+COUNTS_MIN_N, COUNTS_SHARE_MIN = 100, 0.5
 # Skins are a few mm thick, and forces on them are smaller than this number of N. In grams, a force of 1 N would be 102.
 FORCE_MAX_N = 100.0
 FORCE_MIN_N = 0.05  # every recording has a touch with a larger force in N; in kg, a force of 0.4 N would be 0.04
@@ -32,7 +34,7 @@ EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0  # limits of the extent of all places,
 # to be wrong. If they are a larger fraction, the unit is assumed to be wrong.
 FAR_SHARE_MAX = 0.1
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0  # limits of the greatest depth of a recording
-STEP_RULE = "0.15 to 9.68 uT, which are the steps that an MLX90393 can have"
+STEP_RULE = "0.1 to 100 uT, or that of a chip in reskin/board/chips.py"
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
@@ -49,7 +51,10 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
         raise CaptureError(
             where, "field", rule, f"{usual_uT:.4g}", "If the unit of the file is mT or G, convert the fields to uT."
         )
+    _refuse_counts(b_uT, where)
     step_uT = _find_step(b_uT)
+    if chips.with_step(step_uT):
+        return
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
         remedy = f"The unit is probably {unit}. Convert the fields to uT."
@@ -64,6 +69,8 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
     """
     _check_full_scale(db_uT, where, first_line_n)
     step_uT = _find_step(db_uT)
+    if chips.with_step(step_uT):
+        return
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
         remedy = "The unit is probably nT, mT or G. Convert the field changes to uT."
         raise CaptureError(where, "the step between values of the field change", STEP_RULE, f"{step_uT:.3g}", remedy)
@@ -149,6 +156,19 @@ def check_log(log: ProbeLog, where: str) -> None:
     if len(known_N) and np.median(known_N) < 0:
         got = f"{np.median(known_N):.4g} N"
         raise CaptureError(where, "the median of Fz_N in contact", "positive", got, "Reverse the sign of Fz_N.")
+
+
+def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:
+    """Raise if all values are whole numbers in steps of 1, because these are the raw counts of a chip."""
+    values = b_uT[np.isfinite(b_uT).all(axis=1)]
+    if len(values) < COUNTS_MIN_N or not (values == np.rint(values)).all():
+        return
+    gaps = np.concatenate([np.diff(np.unique(column)) for column in values.T])
+    if len(gaps) and (gaps == 1).mean() > COUNTS_SHARE_MIN:
+        raise CaptureError(
+            f"{where}: all fields are whole numbers in steps of 1, so they are probably raw counts. Multiply them by "
+            "the step of the chip in uT (reskin/board/chips.py lists the steps of some chips)."
+        )
 
 
 def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:

@@ -86,7 +86,7 @@ def test_live_without_options_shows_all_boards(monkeypatch):
         "reskin.live.server.serve", lambda sessions, **options: shown.update(options, sessions=sessions)
     )
     monkeypatch.setattr(
-        "reskin.board.find.find_boards", lambda: [find.DetectedBoard(f"/dev/ttyACM{i}", None) for i in (0, 1)]
+        "reskin.board.find.find_boards", lambda **_: [find.DetectedBoard(f"/dev/ttyACM{i}", None) for i in (0, 1)]
     )
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
     assert [str(session) for session in shown["sessions"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]

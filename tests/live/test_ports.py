@@ -46,7 +46,7 @@ def test_properties_of_a_board_are_detected_from_its_bytes(wire, chips_n, rate_h
 def test_devices_that_send_other_bytes_are_not_taken_for_boards():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
-    assert "the baud rate is wrong" in str(find.recognise("port", wrong_baud))
+    assert "Check the baud rate" in str(find.recognise("port", wrong_baud))
     assert "no bytes arrived" in str(find.recognise("port", []))
     assert "cannot open the port" in str(find.detect_board("/dev/none"))
 
@@ -120,7 +120,7 @@ def test_find_board_raises_unless_exactly_one_board_is_connected(monkeypatch):
         found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
     # The result of the scan above is used again, because listening to a port takes 1.5 s.
     with monkeypatch.context() as listened:
-        listened.setattr(find, "detect_board", lambda port, _: found[port])
+        listened.setattr(find, "detect_board", lambda port, *_: found[port])
         assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
             find.find_board([name, other])

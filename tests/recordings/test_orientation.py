@@ -8,8 +8,8 @@ import pytest
 from reskin.recordings.orientation import ORIENTATIONS, Presses, other_orientation, presses_of
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
+from tests.fields import fields_uT
 from tests.recordings.headers import DEFAULT_POLICY, make_header
-from tests.universal.skins import fields_uT
 
 DEPARTURES = [name for name in ORIENTATIONS if name != "as they are"]
 

@@ -70,16 +70,12 @@ def test_sd_card_log_without_temperatures_is_read(log):
         (lambda rows: [rows[0].replace(",Bz1", ""), *rows[1:]], "column 9 must be Bz1; the line ends at By1"),
         (lambda rows: [rows[0].replace("T1,", ""), *rows[1:]], "column 6 is 'Bx1'; it must be T1"),
         (lambda rows: [rows[0].replace("T0,", ""), *rows[1:]], "column 5 is 'T1'; it must be Bx1"),
-        (lambda rows: [rows[0].replace("T0,", "").replace("T1,", ""), *rows[1:]], "9 columns, but row 1 has 7"),
+        (lambda rows: [rows[0].replace("T0,", "").replace("T1,", ""), *rows[1:]], "60 of 60 lines are torn"),
         (lambda rows: [line.replace(",", ";") for line in rows], "line 1 contains semicolons"),
         (lambda rows: ["phase,x_mm,y_mm,Bx0\n", *rows[1:]], "labels or estimates.* reskin add"),
         (lambda rows: [*rows[:-1], rows[-1].rstrip()], "the last line is incomplete"),
-        (lambda rows: [*rows[:-1], rows[-1][:20] + "\n"], r"row 61: the row has \d columns, but row 1 has 9"),
         (lambda rows: [*rows[:9], rows[9].replace("0.0360", "0.0300"), *rows[10:]], "row 10: t_s must be later"),
         (lambda rows: [*rows[:9], rows[8], *rows[9:]], "row 10: t_s must be later"),
-        (lambda rows: [*rows[:5], rows[5][: rows[5].rindex(",")] + ",nan\n", *rows[6:]], "row 6: Bz1 must be a finite"),
-        (lambda rows: [*rows[:5], rows[5][: rows[5].rindex(",")] + ",\n", *rows[6:]], "row 6: Bz1 must be a finite"),
-        (lambda rows: [*rows[:5], rows[5].replace(".", "x"), *rows[6:]], "row 6: t_s must be a number; got '0x"),
         (lambda rows: rows[:1], "the log has no lines"),
         (lambda rows: rows[:2], "fewer than two lines"),
         (lambda _: [], "the file is empty"),
@@ -90,6 +86,27 @@ def test_log_with_invalid_content_is_refused(log, change, message):
     with pytest.raises(CaptureError, match=message) as refused:
         read_log(log)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda row: row[:20] + "\n",
+        lambda row: row[: row.rindex(",")] + ",nan\n",
+        lambda row: row[: row.rindex(",")] + ",\n",
+        lambda row: row.replace(".", "x"),
+    ],
+    ids=["short", "nan", "empty", "no numbers"],
+)
+@pytest.mark.parametrize("line_i", [5, 60], ids=["inside", "last"])
+def test_torn_lines_are_dropped_and_counted(log, damage, line_i):
+    whole = read_log(log)
+    rows = lines(log)
+    log.write_text("".join([*rows[:line_i], damage(rows[line_i]), *rows[line_i + 1 :]]))
+    t_s, b_uT, _, account = read_log(log)
+    assert account["dropped_torn_lines_n"] == 1
+    np.testing.assert_array_equal(b_uT, np.delete(whole[1], line_i - 1, axis=0))
+    assert len(t_s) == account["rows_n"] == len(whole[0]) - 1
 
 
 def test_missing_log_is_reported(tmp_path):

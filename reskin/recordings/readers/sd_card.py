@@ -9,12 +9,12 @@ from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float, Float32, Float64
 
 from reskin.board import faults
 from reskin.errors import CaptureError
 from reskin.recordings import tables
+from reskin.recordings.fault_policy import FROZEN, reading_faults_of_table
 from reskin.recordings.tables import FIRST_ROW
 from reskin.recordings.units import check_fields
 
@@ -26,6 +26,7 @@ RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
 SHOWN_CHIPS_MAX = 5  # if there are more chips, the line of column names is too long for an error message
 # Assumed: if a smaller fraction of the frames is fault-free, the log is refused, because contacts would be missed.
 KEPT_SHARE_MIN = 0.5
+TORN_SHARE_MAX = 0.5  # assumed: with a larger share of torn lines, the log is refused
 # times in s, fields in uT, temperatures in degC, and an account (counts by name)
 Log = tuple[Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]]
 GAP_FRAMES = 1.5  # frames are missing if the time between two frames exceeds the median time by this factor
@@ -61,16 +62,24 @@ def read_log(path: Path) -> Log:
     """
     where = str(path)
     names = _read_names(path, where)
-    table = tables.parse_csv(path, dict.fromkeys(names, pa.float64()), where)
-    if not len(table):
+    numbers, short_n = tables.parse_torn_csv(path, names, where)
+    if not len(numbers) + short_n:
         raise CaptureError(f"{where}: the log has no lines below the column names. Copy the log again.")
-    numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
+    whole = np.isfinite(numbers).all(axis=1)
+    torn_n = short_n + int((~whole).sum())
+    numbers = numbers[whole]
+    if torn_n > TORN_SHARE_MAX * (torn_n + len(numbers)):
+        raise CaptureError(
+            f"{where}: {torn_n} of {torn_n + len(numbers)} lines are torn: cells are missing or are no numbers. Check "
+            "the program that wrote the log, and log again."
+        )
     chips_n = sum(name.startswith("Bx") for name in names)
     chips = numbers[:, 1:].reshape(len(numbers), chips_n, -1)
     b_uT = chips[:, :, -3:].reshape(len(chips), -1).astype(np.float32)
     measured = chips.shape[2] == len(CHIP_COLUMNS)
     temperature_degC = (chips[:, :, 0] if measured else np.full(chips.shape[:2], np.nan)).astype(np.float32)
-    return keep_whole(numbers[:, 0], b_uT, temperature_degC, where, first_row=FIRST_ROW)
+    *log, account = keep_whole(numbers[:, 0], b_uT, temperature_degC, where, first_row=FIRST_ROW)
+    return *log, ({"dropped_torn_lines_n": torn_n} if torn_n else {}) | account  # type: ignore[return-value]
 
 
 def keep_whole(
@@ -86,7 +95,6 @@ def keep_whole(
     `first_row` is the number of the first row, for the row numbers in errors.
     """
     _check_time(t_s, where, first_row)
-    check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
     whole = ~failed & ~stuck
     account = _gaps(t_s) | {
@@ -96,6 +104,7 @@ def keep_whole(
         "rows_n": int(whole.sum()),
     }
     _check_kept(account, where)
+    check_fields(b_uT[whole], where, first_line_n=first_row)
     return t_s[whole], b_uT[whole], temperature_degC[whole], account
 
 
@@ -127,6 +136,11 @@ def _read_names(path: Path, where: str) -> list[str]:
     except OSError as error:
         reason = "the file is empty" if path.is_file() and not path.stat().st_size else error.strerror
         raise CaptureError(f"{where}: cannot read the log: {reason}. Check the path.") from None
+    if not first.removeprefix(BOM_UTF8).rstrip().isascii() or b"\0" in first:
+        raise CaptureError(
+            f"{where}: the file is not text. If it has the raw bytes of a port, decode them first: reskin decode "
+            f"{path.name} --out frames.parquet"
+        )
     # If the log was saved by a text editor or a spreadsheet, it may begin with a byte order mark, so remove this mark.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     temperatures = _has_temperatures(names)
@@ -172,14 +186,6 @@ def _header_fault(names: list[str]) -> str:
     return f"line 1: column {wrong_i + 1} is {got!r}; it must be {wanted[wrong_i]} (columns: {rule}). Correct line 1."
 
 
-def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
-    """Return the column `name`; raise if it has a value that is not finite."""
-    values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
-    remedy = "Remove this line. The frame is then counted as missing."
-    tables.refuse_row(~np.isfinite(values), where, name, "a finite number", values, remedy)
-    return values
-
-
 def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> None:
     if len(t_s) < 2:
         raise CaptureError(f"{where}: the log has fewer than two lines below the column names. Copy the log again.")
@@ -200,9 +206,12 @@ def _faults(
     b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str, first_row: int
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
-    failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
+    failed = reading_faults_of_table(b_uT, temperature_degC).failed_rows
+    failed[~failed] = faults.lone_jumps(b_uT[~failed]).any(axis=1)
     if failed.all():
         raise CaptureError(f"{where}: in every line, the I2C read of a chip failed. Check the wiring, and log again.")
+    if faults.is_frozen(b_uT[~failed]):
+        raise CaptureError(f"{where}: {FROZEN}")
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))

@@ -88,10 +88,10 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     known = [column for column in columns[1:] if column in names and not _is_empty(column, names, cells)]
     numbers = dict(zip(known, _to_numbers(names, cells, known, contact, where).T, strict=True))
     b_uT = np.stack([numbers[column] for column in columns[len(NEEDED) : len(NEEDED) + 3 * header.chips_n]], axis=1)
-    _check(numbers, b_uT, contact, where)
     unknown = np.full(len(contact), np.nan)
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
     rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
+    _check(numbers, b_uT, contact, rows.keep, where)
     press = _number_presses(numbers, contact, where)
     # Number the blocks of rows. A block is a run of no-load rows together with the contact rows after it.
     block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)
@@ -184,10 +184,11 @@ def _check(
     numbers: Mapping[str, Float64[np.ndarray, " f"]],
     b_uT: Float64[np.ndarray, "f ch"],
     contact: Bool[np.ndarray, " f"],
+    keep: Bool[np.ndarray, " f"],
     where: str,
 ) -> None:
-    _refuse_subtracted(b_uT, contact, where)
-    check_fields(b_uT, where, first_line_n=FIRST_LINE_N)
+    _refuse_subtracted(b_uT[keep], contact[keep], where)
+    check_fields(b_uT[keep], where, first_line_n=FIRST_LINE_N)
     place_mm = np.where(contact[:, None], np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1), np.nan)
     check_places(place_mm, where, first_line_n=FIRST_LINE_N)
     if "depth_mm" in numbers:

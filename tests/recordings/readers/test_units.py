@@ -53,7 +53,7 @@ def test_fields_of_a_board_are_accepted_only_in_microtesla(name: str, seed: int)
 
 
 def test_strong_fields_in_gauss_are_recognised_by_the_step_of_the_chips() -> None:
-    with pytest.raises(CaptureError, match="0.15 to 9.68 uT, .*; got 0.024. The unit is probably G"):
+    with pytest.raises(CaptureError, match="must be 0.1 to 100 uT, .*; got 0.024. The unit is probably G"):
         check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
 
 

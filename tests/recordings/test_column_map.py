@@ -1,0 +1,130 @@
+"""Tests of maps of columns: tables of other recorders become tables of layout `table`."""
+
+import gzip
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from reskin.errors import CaptureError, ParamsError
+from reskin.recordings.column_map import convert, read_map
+from reskin.seeds import rng_for
+
+FIELDS = [f"B{axis}{chip}" for chip in range(2) for axis in "xyz"]
+RIGHT = pd.DataFrame(
+    {
+        "phase": ["noload"] * 3 + ["contact"] * 3, "x_mm": [1.0, 1, 1, 2, 2, 2.5], "y_mm": [-4.0] * 6,
+        "Fz_N": [0.0, 0, 0, 1, 2, 3], "t_s": np.arange(6) + 0.25,
+        **dict(zip(FIELDS, rng_for(0, "fields").normal(500, 20, (6, 6)).round(2).T, strict=True)),
+    }
+)  # fmt: skip
+MAP = """\
+fields: {Bx: "mag{}_x", By: "mag{}_y", Bz: "mag{}_z", first: 1, unit: mT, signs: [1, 1, -1]}
+phase: {of: pressed, contact: [1]}
+decimal_comma: true
+columns:
+  x_mm: {of: "X [cm]", unit: cm, sign: -1}
+  y_mm: {of: Y, unit: cm}
+  Fz_N: {of: load, unit: g}
+  t_s: {of: [sec, nsec], unit: [s, ns]}
+"""
+SAME = """\
+fields: {Bx: "B{}x", By: "B{}y", Bz: "B{}z"}
+phase: phase
+columns: {x_mm: x_mm, y_mm: y_mm, Fz_N: Fz_N, t_s: t_s}
+"""
+
+
+def foreign():
+    data = {
+        "sec": range(6), "nsec": [250_000_000] * 6, "pressed": [0, 0, 0, 1, 1, 1], "X [cm]": -RIGHT.x_mm / 10,
+        "Y": RIGHT.y_mm / 10, "load": RIGHT.Fz_N / 9.80665e-3, "remark": "a",
+    }  # fmt: skip
+    signs = {"x": 1, "y": 1, "z": -1}
+    return pd.DataFrame(data | {f"mag{int(n[2]) + 1}_{n[1]}": signs[n[1]] * RIGHT[n] / 1e3 for n in FIELDS})
+
+
+def converted(tmp_path, file, text):
+    (tmp_path / "map.yaml").write_text(text)
+    return convert(file, read_map(tmp_path / "map.yaml")).to_pandas()
+
+
+def check(found):
+    assert set(found) == set(RIGHT)
+    assert list(found.phase) == list(RIGHT.phase)
+    for name in RIGHT.columns.drop("phase"):
+        np.testing.assert_allclose(found[name], RIGHT[name], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|"])
+def test_names_units_signs_and_split_times_are_converted(tmp_path, separator):
+    foreign().to_csv(tmp_path / "a.csv", sep=separator, decimal=",", index=False)
+    check(converted(tmp_path, tmp_path / "a.csv", MAP))
+
+
+def renamed():
+    return RIGHT.rename(columns={name: f"B{name[2]}{name[1]}" for name in FIELDS})
+
+
+@pytest.mark.parametrize("container", ["csv", "utf-16", "gz", "parquet", "jsonl"])
+def test_containers_are_read(tmp_path, container):
+    file, data = tmp_path / f"a.{container}", renamed()
+    match container:
+        case "csv" | "utf-16":
+            data.to_csv(file, index=False, encoding="utf-8" if container == "csv" else "utf-16")
+        case "gz":
+            file.write_bytes(gzip.compress(data.to_csv(index=False).encode()))
+        case "parquet":
+            data.to_parquet(file)
+        case "jsonl":
+            data.to_json(file, orient="records", lines=True, double_precision=15)
+    check(converted(tmp_path, file, SAME))
+
+
+LISTED = SAME.replace('{Bx: "B{}x", By: "B{}y", Bz: "B{}z"}', "{of: b}")
+
+
+def test_lists_of_fields_and_arrays_are_read(tmp_path):
+    lists = RIGHT.drop(columns=FIELDS).assign(b=list(RIGHT[FIELDS].to_numpy()))
+    lists.to_parquet(tmp_path / "a.parquet")
+    check(converted(tmp_path, tmp_path / "a.parquet", LISTED))
+    others = {name: RIGHT[name].to_numpy() for name in ("x_mm", "y_mm", "Fz_N", "t_s")}
+    np.savez(tmp_path / "a.npz", b=RIGHT[FIELDS].to_numpy(), **others)
+    check(converted(tmp_path, tmp_path / "a.npz", LISTED.replace("phase: phase", "phase: {of: Fz_N, above: 0.1}")))
+
+
+def test_times_may_be_dates(tmp_path):
+    data = renamed().assign(t_s=[f"2026-11-29T12:00:0{i}.5Z" for i in range(6)])
+    data.to_csv(tmp_path / "a.csv", index=False)
+    found = converted(tmp_path, tmp_path / "a.csv", SAME.replace("t_s: t_s", "t_s: {of: t_s, unit: iso}"))
+    np.testing.assert_allclose(found.t_s, np.arange(6))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("x_mm: x_mm", "x_mm: X"), "no column 'X'; the file has phase, x_mm"),
+        (("Fz_N: Fz_N", "Fz_N: {of: Fz_N, unit: pound}"), "Fz_N: unit pound is not one of N, mN, kN, g, kg"),
+        (("Fz_N: Fz_N", "Fn_N: Fz_N"), "Fn_N is not one of x_mm, y_mm"),
+        (("phase: phase", "phase: {of: phase}"), "state either `contact` or `above`"),
+        (
+            ("phase: phase", "phase: {of: phase, contact: [touch]}"),
+            "by column phase, which has noload, contact",
+        ),
+        (("t_s: t_s", "t_s: phase"), "phase in line 2 must be a number; got 'noload'"),
+    ],
+)
+def test_mistakes_in_a_map_are_named(tmp_path, change, message):
+    renamed().to_csv(tmp_path / "a.csv", index=False)
+    with pytest.raises((CaptureError, ParamsError), match=message):
+        converted(tmp_path, tmp_path / "a.csv", SAME.replace(*change))
+
+
+@pytest.mark.parametrize(
+    ("start", "what"),
+    [(b"\x89HDF\r\n", "an HDF5 file"), (b"PK\x03\x04", "a zip or Excel file"), (b"\x89MCAP", "an MCAP")],
+)
+def test_other_containers_are_named_with_a_remedy(tmp_path, start, what):
+    (tmp_path / "a.csv").write_bytes(start + bytes(100))
+    with pytest.raises(CaptureError, match=f"the file is {what}.*\\. (Write|Save|Export)"):
+        converted(tmp_path, tmp_path / "a.csv", SAME)
