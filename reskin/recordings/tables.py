@@ -288,6 +288,8 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
     """Raise if one of the wanted columns is missing, or if two columns have the same name."""
     missing = [name for name in wanted if name not in names]
     if missing:
+        if renamed := _renaming(names, wanted):
+            raise CaptureError(f"{where}: no column {', '.join(missing)}. {renamed}")
         raise CaptureError(
             f"{where}: no column {', '.join(missing)}. Check that the layout is {layout}, and that line 1 has the "
             "column names. See data/README.md. If the values have other names or units, describe them in a file for "
@@ -296,6 +298,20 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:
         raise CaptureError(f"{where}: two columns have the name {twice[0]}. Remove one of these columns.")
+
+
+def _renaming(names: list[str], wanted: list[str]) -> str:
+    """Return a sentence on other habits of naming: other capitals, or chips that are numbered from 1; else empty."""
+    lower = {name.lower(): name for name in names}
+    if all(name.lower() in lower for name in wanted):
+        found = [f"{lower[name.lower()]} to {name}" for name in wanted if name not in names]
+        return f"Rename {', '.join(found)}."
+    if "Bx0" not in names and {"Bx1", "By1", "Bz1"} <= set(names):
+        return (
+            "The chips seem to be numbered from 1. Number them from 0, or state it in a file for option --columns: "
+            'fields: {Bx: "Bx{}", By: "By{}", Bz: "Bz{}", first: 1} (docs/add-a-skin.md).'
+        )
+    return ""
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:

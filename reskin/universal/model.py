@@ -466,7 +466,8 @@ class Universal:
     def refine(self) -> "Universal":
         """Train the network further on this skin's labelled presses, mixed with simulated skins.
 
-        This takes about 20 s, and improves the estimates of places if there are many labels. It requires PyTorch. The
+        This takes about 20 s, and improves the estimates of places if there are many labels all over the skin. On sides
+        of the skin without labels, they get worse. It requires PyTorch. The
         refined network belongs to this skin: it is saved with it, and is dropped by `zero` and `label` without `keep`.
         The model is changed in place and returned.
 

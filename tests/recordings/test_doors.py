@@ -17,7 +17,7 @@ from reskin.errors import CaptureError
 from reskin.logs import quiet_start
 from reskin.recordings.fault_policy import STANDARD_POLICY, FaultLog
 from reskin.recordings.readers import sd_card
-from reskin.recordings.tables import read_cells
+from reskin.recordings.tables import check_columns, read_cells
 from reskin.recordings.units import check_fields
 from reskin.seeds import rng_for
 
@@ -184,6 +184,19 @@ def test_noise_alone_is_not_taken_for_a_touch_but_presses_are_found(rate_hz, chi
             pass
     assert refused_n <= 2
     assert missed_n <= (60 if rate_hz == 5 else 1)  # at 5 Hz, the first two windows reach beyond the start of the press
+
+
+@pytest.mark.parametrize(
+    ("names", "remedy"),
+    [
+        (["PHASE", "x_mm", "Bx0", "by0", "Bz0"], "Rename PHASE to phase, by0 to By0."),
+        (["phase", "x_mm", "Bx1", "By1", "Bz1"], "The chips seem to be numbered from 1"),
+        (["phase", "x_mm", "mag"], "describe them in a file for option --columns"),
+    ],
+)
+def test_renamings_are_proposed(names, remedy):
+    with pytest.raises(CaptureError, match=remedy):
+        check_columns(names, ["phase", "x_mm", "Bx0", "By0", "Bz0"], "here", layout="table")
 
 
 @pytest.mark.parametrize(
