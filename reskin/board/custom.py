@@ -88,14 +88,14 @@ class CustomWire(Strict):
     def __str__(self) -> str:
         return f"{self.kind} of {len(self.columns)} columns"
 
-    def scan(self, octets: UInt8[np.ndarray, " bytes"], *, final: bool) -> tuple[Frames, Counter[str], int]:
+    def scan(self, octets: UInt8[np.ndarray, " bytes"]) -> tuple[Frames, Counter[str], int]:
         """Find the frames in a buffer of bytes that begins after the previous frame or line.
 
         Returns the frames, counts of bytes and frames as in `reskin.board.stream.ACCOUNT`, and the number of settled
         bytes: those that need not be scanned again when more bytes arrive.
         """
         find = self._lines if self.kind == "text" else self._records
-        values, end_byte, length_n, settled_n = find(octets, final)
+        values, end_byte, length_n, settled_n = find(octets)
         frames = self._frames(values, end_byte)
         finite = np.isfinite(frames.b_uT).all(axis=1)
         count = Counter(
@@ -106,7 +106,7 @@ class CustomWire(Strict):
         return frames.where(finite), count, settled_n
 
     def _lines(
-        self, octets: UInt8[np.ndarray, " bytes"], final: bool
+        self, octets: UInt8[np.ndarray, " bytes"]
     ) -> tuple[Float64[np.ndarray, "f c"], Int64[np.ndarray, " f"], Int64[np.ndarray, " f"], int]:
         ends = np.flatnonzero(octets == LF) + 1
         point = b"," if self.decimal_comma else b"."
@@ -123,7 +123,7 @@ class CustomWire(Strict):
         return values, np.array(end_byte, int), np.array(length_n, int), len(octets) if too_long else start
 
     def _records(
-        self, octets: UInt8[np.ndarray, " bytes"], final: bool
+        self, octets: UInt8[np.ndarray, " bytes"]
     ) -> tuple[Float64[np.ndarray, "f c"], Int64[np.ndarray, " f"], Int64[np.ndarray, " f"], int]:
         n = self.frame_bytes_n
         starts = self._starts(octets)

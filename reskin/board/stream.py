@@ -200,7 +200,7 @@ def _are_plausible(frames: Frames) -> bool:
 def _scan(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: AnyWire, chips_n: int) -> _Scan:
     """Find and decode the frames in a buffer of bytes, in any format."""
     if isinstance(wire, CustomWire):
-        frames, count, settled_n = wire.scan(octets, final=final)
+        frames, count, settled_n = wire.scan(octets)
         return _Scan(frames, count, settled_n, at_boundary=True)
     scan = _scan_lines if wire in wires.TEXT_WIRES else _scan_binary
     return scan(octets, at_boundary, final, wire, chips_n)

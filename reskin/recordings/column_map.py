@@ -19,7 +19,7 @@ from pydantic import Field
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, ParamsError, did_you_mean
 from reskin.recordings.header import Source
-from reskin.recordings.tables import count_chips_of, text_of
+from reskin.recordings.tables import text_of
 
 UNITS = {  # factors to mm, uT, N and s
     "mm": {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "in": 25.4},
@@ -116,15 +116,18 @@ def convert(recording: Path, columns: ColumnMap) -> pa.Table:
     where, data = str(recording), _read(recording, columns)
     made: dict[str, np.ndarray | list[str]] = {}
 
-    def numbers(name: str) -> Float64[np.ndarray, " f"]:
+    def column_of(name: str) -> pd.Series:
         if name not in data:
             have = ", ".join(map(str, data.columns))[:200]
             guess = did_you_mean(name, map(str, data.columns))
             raise CaptureError(f"{where}: no column {name!r}; the file has {have}.{guess} Correct the map of columns.")
-        return _numbers(data[name], name, columns, where)
+        return data[name]
+
+    def numbers(name: str) -> Float64[np.ndarray, " f"]:
+        return _numbers(column_of(name), name, columns, where)
 
     of_fields = columns.fields
-    fields = _listed(data, of_fields.of, where) if of_fields.of else _numbered(of_fields, numbers, data)
+    fields = _listed(data, of_fields.of, column_of, where) if of_fields.of else _numbered(of_fields, numbers, data)
     factor = UNITS["uT"][of_fields.unit] * np.tile(of_fields.signs, fields.shape[1] // 3)
     for i, values in enumerate((fields * factor).T):
         made[f"B{'xyz'[i % 3]}{i // 3}"] = values
@@ -134,15 +137,12 @@ def convert(recording: Path, columns: ColumnMap) -> pa.Table:
     for name, column in columns.columns.items():
         total = np.zeros(len(data))
         for of, times in _factors(name, column, where):
-            total += _seconds(data[of], where) if times is None else times * numbers(of)
+            total += _seconds(column_of(of), where) if times is None else times * numbers(of)
         made[name] = total if isinstance(column, str) else column.sign * total
-    made["phase"] = _phases(data, columns.phase, numbers, where)
+    phase = columns.phase if isinstance(columns.phase, Phase) else Phase(of=columns.phase, contact=("contact",))
+    of_phase = column_of(phase.of) if phase.above is None else numbers(phase.of)
+    made["phase"] = _phases(of_phase, phase, where)
     return pa.table(made)
-
-
-def chips_of(table: pa.Table) -> int:
-    """Count the chips of a converted table."""
-    return count_chips_of(table.column_names)
 
 
 def _factors(name: str, column: str | Column, where: str) -> list[tuple[str, float | None]]:
@@ -219,13 +219,13 @@ def _numbers(values: pd.Series, name: str, columns: ColumnMap, where: str) -> Fl
     return values.to_numpy(dtype=float, na_value=np.nan)
 
 
-def _listed(data: pd.DataFrame, name: str, where: str) -> Float64[np.ndarray, "f ch"]:
-    parts = [column for column in data if re.fullmatch(re.escape(name) + r"\d+", str(column))]
-    if name not in data and not parts:
-        raise CaptureError(f"{where}: no column {name!r}; the file has {', '.join(data.columns)}. Correct the map.")
-    if name not in data:
-        return data[parts].to_numpy(float)
-    rows = [np.ravel(np.asarray(row, float)) for row in data[name]]
+def _listed(
+    data: pd.DataFrame, name: str, column_of: Callable[[str], pd.Series], where: str
+) -> Float64[np.ndarray, "f ch"]:
+    """Return the fields in a column of lists, or in the numbered columns of an array."""
+    numbered = [column for column in data if re.fullmatch(re.escape(name) + r"\d+", str(column))]
+    lists = data[numbered].to_numpy(float) if name not in data and numbered else column_of(name)
+    rows = [np.ravel(np.asarray(row, float)) for row in lists]
     if not rows or {len(row) for row in rows} != {len(rows[0])} or len(rows[0]) % 3:
         raise CaptureError(f"{where}: the lists in column {name} must have equal lengths, three values for each chip.")
     return np.stack(rows)
@@ -243,18 +243,16 @@ def _numbered(
     return np.stack(parts, axis=1)
 
 
-def _phases(
-    data: pd.DataFrame, phase: str | Phase, numbers: Callable[[str], Float64[np.ndarray, " f"]], where: str
-) -> list[str]:
-    phase = Phase(of=phase, contact=("contact",)) if isinstance(phase, str) else phase
-    if phase.above is not None or phase.of not in data:
-        contact = numbers(phase.of) > (phase.above or 0.0)
+def _phases(values: pd.Series | Float64[np.ndarray, " f"], phase: Phase, where: str) -> list[str]:
+    """Return the phases of rows from the values of the column that tells contact."""
+    if phase.above is not None:
+        contact = np.asarray(values) > phase.above
     else:
         wanted = {_plain(value) for value in np.atleast_1d(np.array(phase.contact, object))}
-        contact = np.array([_plain(value) in wanted for value in data[phase.of]], bool)
+        contact = np.array([_plain(value) in wanted for value in values], bool)
     if not contact.any():
-        values = ", ".join(map(str, data[phase.of].unique()[:SHOWN_N])) if phase.of in data else "none"
-        problem = f"no row is in contact by column {phase.of}, which has {values}"
+        shown = ", ".join(map(str, pd.unique(pd.Series(values))[:SHOWN_N]))
+        problem = f"no row is in contact by column {phase.of}, which has {shown}"
         raise CaptureError(f"{where}: {problem}. Correct `phase` in the map.")
     return ["contact" if touching else "noload" for touching in contact]
 

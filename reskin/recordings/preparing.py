@@ -25,6 +25,7 @@ from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS, table
+from reskin.recordings.tables import count_chips_of
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # name of the board and of the skin in a recording that was made without names
@@ -136,11 +137,10 @@ def mapped(recording: Path, names: CaptureNames, map_file: Path) -> Prepared:
     converted = column_map.convert(recording, columns)
     content = pa.BufferOutputStream()
     pq.write_table(converted, content)
-    header = _header(names, recording, layout="table", chips_n=column_map.chips_of(converted), options={})
+    header = _header(names, recording, layout="table", chips_n=count_chips_of(converted.column_names), options={})
     note = f"converted by reskin add from {recording.name} with {map_file.name}"
-    return header.model_copy(update={"note": note, "source": columns.source}), {
-        table.PARQUET: content.getvalue().to_pybytes()
-    }
+    header = header.model_copy(update={"note": note, "source": columns.source})
+    return header, {table.PARQUET: content.getvalue().to_pybytes()}
 
 
 def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:

@@ -69,17 +69,16 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
     return table.select(list(types)).combine_chunks()
 
 
-def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> tuple[Float64[np.ndarray, "f c"], int]:
+def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> Float64[np.ndarray, "f c"]:
     """Read a CSV file of numbers that a program wrote line by line, some of whose lines may be torn.
 
-    Returns the numbers, in which cells that are empty or are no numbers are NaN, and the number of lines that were left
-    out because they have too few or too many cells. Raises CaptureError if the file is not readable text.
+    Cells that are empty or are no numbers are NaN, and so are all cells of lines with too few or too many of them.
+    Raises CaptureError if the file is not readable text.
     """
-    torn_n = 0
+    torn_row = []
 
-    def skip(_: Any) -> str:
-        nonlocal torn_n
-        torn_n += 1
+    def skip(row: Any) -> str:
+        torn_row.append(row.number - FIRST_ROW)
         return "skip"
 
     text = pa.string()
@@ -93,12 +92,14 @@ def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> tuple[Float6
     except (pa.ArrowInvalid, UnicodeDecodeError, KeyError) as error:
         got = ascii(" ".join(str(error).split()))[1:-1][:200]
         raise CaptureError(f"{where}: not a CSV file with columns {_list(list(names))}: {got}. {COPY_AGAIN}") from None
-    numbers = np.empty((len(table), len(names)))
+    rows_n = len(table) + len(torn_row)
+    whole = ~np.isin(np.arange(rows_n), torn_row)
+    numbers = np.full((rows_n, len(names)), np.nan)
     for i, name in enumerate(names):
         cells = pc.utf8_trim_whitespace(table.column(name))
         is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
-        numbers[:, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
-    return numbers, torn_n
+        numbers[whole, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
+    return numbers
 
 
 def _column_names(source: str | Path) -> list[str]:

@@ -4,7 +4,7 @@ The checks raise `CaptureError` if the values are not plausible in these units, 
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from reskin.board import chips, faults
 from reskin.errors import CaptureError
@@ -37,14 +37,16 @@ DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0  # limits of the greatest depth of a re
 STEP_RULE = "0.1 to 100 uT, or that of a chip in reskin/board/chips.py"
 
 
-def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if raw fields are probably not in uT.
+def check_fields(
+    b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int = 1, line_n: Int[np.ndarray, " f"] | None = None
+) -> None:
+    """Raise if raw fields are probably not in uT. `line_n` has the line of each row, if they do not follow one another.
 
     There are three signs of another unit: the fields exceed the chip's full scale; they are weaker than the earth's
     field; or the steps between their values are not possible for the chip in uT. The steps can be detected only if the
     values were neither averaged nor rounded to a few decimals.
     """
-    _check_full_scale(b_uT, where, first_line_n)
+    _check_full_scale(b_uT, where, first_line_n + np.arange(len(b_uT)) if line_n is None else line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
         rule = f"{WEAKEST_uT:g} uT or more on most chips, because the earth's field alone is stronger"
@@ -53,7 +55,7 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
         )
     _refuse_counts(b_uT, where)
     step_uT = _find_step(b_uT)
-    if chips.with_step(step_uT):
+    if chips.is_step(step_uT):
         return
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
@@ -67,9 +69,9 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
     There are two signs of another unit: the changes exceed the chip's full scale, or the steps between their values are
     not possible for the chip in uT. Unlike raw fields, field changes may be weak.
     """
-    _check_full_scale(db_uT, where, first_line_n)
+    _check_full_scale(db_uT, where, first_line_n + np.arange(len(db_uT)))
     step_uT = _find_step(db_uT)
-    if chips.with_step(step_uT):
+    if chips.is_step(step_uT):
         return
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
         remedy = "The unit is probably nT, mT or G. Convert the field changes to uT."
@@ -171,10 +173,10 @@ def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:
         )
 
 
-def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:
+def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, line_n: Int[np.ndarray, " f"]) -> None:
     b_max_uT = np.abs(b_uT).max(axis=1)
     if b_max_uT.max() > FULL_SCALE_uT:
-        place = f"line {first_line_n + int(b_max_uT.argmax())}"
+        place = f"line {line_n[b_max_uT.argmax()]}"
         rule = f"below the full scale of the chip, {FULL_SCALE_uT:.0f} uT"
         got = f"{b_max_uT.max():.6g} in {place}"
         raise CaptureError(

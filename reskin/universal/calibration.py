@@ -150,11 +150,6 @@ FILE_BYTES_MAX_N = 2**24  # larger files are refused; with LABELS_MAX_N labels o
 REMEDY = "Use a skin that `Universal.save` or the page of `reskin live` has saved."
 
 
-def no_presses(channels_n: int = CHANNELS_N) -> Float[np.ndarray, "0 ch"]:
-    """Return no presses, as an array."""
-    return np.zeros((0, channels_n))
-
-
 @dataclass(frozen=True)
 class LabelledPresses:
     """Presses at known places, with their forces (NaN if unknown) and field changes.
@@ -205,7 +200,7 @@ class SkinData:
     @classmethod
     def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "SkinData":
         """Return the data of a skin of which only the no-load field is known."""
-        none = no_presses(len(rest_uT))
+        none = np.zeros((0, len(rest_uT)))
         return cls(rest_uT, none, LabelledPresses(np.zeros((0, 2)), np.zeros(0), none))
 
     def and_seen(self, db_uT: Float[np.ndarray, "n ch"]) -> "SkinData":

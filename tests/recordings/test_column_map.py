@@ -111,6 +111,8 @@ def test_times_may_be_dates(tmp_path):
             ("phase: phase", "phase: {of: phase, contact: [touch]}"),
             "by column phase, which has noload, contact",
         ),
+        (("t_s: t_s", "t_s: {of: time, unit: iso}"), "no column 'time'"),
+        (('{Bx: "B{}x", By: "B{}y", Bz: "B{}z"}', "{of: b}"), "no column 'b'"),
         (("t_s: t_s", "t_s: phase"), "phase in line 2 must be a number; got 'noload'"),
     ],
 )

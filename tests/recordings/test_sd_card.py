@@ -109,6 +109,13 @@ def test_torn_lines_are_dropped_and_counted(log, damage, line_i):
     assert len(t_s) == account["rows_n"] == len(whole[0]) - 1
 
 
+def test_errors_name_the_row_of_the_file_although_torn_lines_were_dropped(log):
+    rows = lines(log)
+    log.write_text("".join([*rows[:3], "1,2\n", *rows[3:9], rows[8], *rows[9:]]))
+    with pytest.raises(CaptureError, match="row 11: t_s must be later"):
+        read_log(log)
+
+
 def test_missing_log_is_reported(tmp_path):
     with pytest.raises(CaptureError, match="file not found"):
         read_log(tmp_path / "log.csv")

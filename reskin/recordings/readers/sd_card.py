@@ -9,7 +9,7 @@ from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from reskin.board import faults
 from reskin.errors import CaptureError
@@ -62,23 +62,23 @@ def read_log(path: Path) -> Log:
     """
     where = str(path)
     names = _read_names(path, where)
-    numbers, short_n = tables.parse_torn_csv(path, names, where)
-    if not len(numbers) + short_n:
+    numbers = tables.parse_torn_csv(path, names, where)
+    if not len(numbers):
         raise CaptureError(f"{where}: the log has no lines below the column names. Copy the log again.")
     whole = np.isfinite(numbers).all(axis=1)
-    torn_n = short_n + int((~whole).sum())
-    numbers = numbers[whole]
-    if torn_n > TORN_SHARE_MAX * (torn_n + len(numbers)):
+    row_n, torn_n = FIRST_ROW + np.flatnonzero(whole), int((~whole).sum())
+    if torn_n > TORN_SHARE_MAX * len(numbers):
         raise CaptureError(
-            f"{where}: {torn_n} of {torn_n + len(numbers)} lines are torn: cells are missing or are no numbers. Check "
-            "the program that wrote the log, and log again."
+            f"{where}: {torn_n} of {len(numbers)} lines are torn: cells are missing or are no numbers. Check the "
+            "program that wrote the log, and log again."
         )
+    numbers = numbers[whole]
     chips_n = sum(name.startswith("Bx") for name in names)
     chips = numbers[:, 1:].reshape(len(numbers), chips_n, -1)
     b_uT = chips[:, :, -3:].reshape(len(chips), -1).astype(np.float32)
     measured = chips.shape[2] == len(CHIP_COLUMNS)
     temperature_degC = (chips[:, :, 0] if measured else np.full(chips.shape[:2], np.nan)).astype(np.float32)
-    *log, account = keep_whole(numbers[:, 0], b_uT, temperature_degC, where, first_row=FIRST_ROW)
+    *log, account = keep_whole(numbers[:, 0], b_uT, temperature_degC, where, row_n)
     return *log, ({"dropped_torn_lines_n": torn_n} if torn_n else {}) | account  # type: ignore[return-value]
 
 
@@ -87,15 +87,15 @@ def keep_whole(
     b_uT: Float32[np.ndarray, "f ch"],
     temperature_degC: Float32[np.ndarray, "f k"],
     where: str,
-    *,
-    first_row: int = 1,
+    row_n: Int64[np.ndarray, " f"] | None = None,
 ) -> Log:
     """Return the fault-free frames, and an account that counts the faulty frames.
 
-    `first_row` is the number of the first row, for the row numbers in errors.
+    `row_n` are the numbers of the rows in errors; by default, rows are numbered from 1.
     """
-    _check_time(t_s, where, first_row)
-    failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
+    row_n = 1 + np.arange(len(t_s)) if row_n is None else row_n
+    _check_time(t_s, where, row_n)
+    failed, stuck = _faults(b_uT, temperature_degC, where, row_n)
     whole = ~failed & ~stuck
     account = _gaps(t_s) | {
         "rows_read_n": len(t_s),
@@ -104,7 +104,7 @@ def keep_whole(
         "rows_n": int(whole.sum()),
     }
     _check_kept(account, where)
-    check_fields(b_uT[whole], where, first_line_n=first_row)
+    check_fields(b_uT[whole], where, line_n=row_n[whole])
     return t_s[whole], b_uT[whole], temperature_degC[whole], account
 
 
@@ -186,7 +186,7 @@ def _header_fault(names: list[str]) -> str:
     return f"line 1: column {wrong_i + 1} is {got!r}; it must be {wanted[wrong_i]} (columns: {rule}). Correct line 1."
 
 
-def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> None:
+def _check_time(t_s: Float64[np.ndarray, " f"], where: str, row_n: Int64[np.ndarray, " f"]) -> None:
     if len(t_s) < 2:
         raise CaptureError(f"{where}: the log has fewer than two lines below the column names. Copy the log again.")
     back = np.diff(t_s) <= 0
@@ -194,7 +194,7 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
         row_i = int(back.argmax()) + 1
         got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
         remedy = "If the board was reset here, split the log into two files before this line."
-        raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
+        raise CaptureError(f"{where} row {row_n[row_i]}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
         rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines per second"
@@ -203,7 +203,10 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
 
 
 def _faults(
-    b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str, first_row: int
+    b_uT: Float32[np.ndarray, "f ch"],
+    temperature_degC: Float32[np.ndarray, "f k"],
+    where: str,
+    row_n: Int64[np.ndarray, " f"],
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
     failed = reading_faults_of_table(b_uT, temperature_degC).failed_rows
@@ -221,7 +224,7 @@ def _faults(
                 "other chips"
             )
             raise CaptureError(
-                f"{where}: from row {block[0] + first_row} on, {problem}. A chip has probably lost its settings: reset "
+                f"{where}: from row {row_n[block[0]]} on, {problem}. A chip has probably lost its settings: reset "
                 "the board and log again."
             )
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed

@@ -188,7 +188,7 @@ def _check(
     where: str,
 ) -> None:
     _refuse_subtracted(b_uT[keep], contact[keep], where)
-    check_fields(b_uT[keep], where, first_line_n=FIRST_LINE_N)
+    check_fields(b_uT[keep], where, line_n=FIRST_LINE_N + np.flatnonzero(keep))
     place_mm = np.where(contact[:, None], np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1), np.nan)
     check_places(place_mm, where, first_line_n=FIRST_LINE_N)
     if "depth_mm" in numbers:
