@@ -96,18 +96,21 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
     return policy.model_copy(update=changes)
 
 
-FROZEN = (
-    "every reading is the same, so the board or the library that reads it repeats one value. Check that the library is "
-    "started and that the chips answer, and record again."
-)
-
-
 def reading_faults_of_table(
-    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
+    b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"], where: str
 ) -> ReadingFaults:
-    """Mark the faults of single readings of a whole table, from whose sound rows the LSB of the chips is found."""
+    """Mark the faults of single readings of a whole table, from whose sound rows the LSB of the chips is found.
+
+    Raises CaptureError if all readings that did not fail are equal.
+    """
     sound = ~find_reading_faults(b_uT, temperature_degC).faulty_rows
-    return find_reading_faults(b_uT, temperature_degC, find_lsb(b_uT[sound]))
+    found = find_reading_faults(b_uT, temperature_degC, find_lsb(b_uT[sound]))
+    if is_frozen(b_uT[~found.failed_rows]):
+        raise CaptureError(
+            f"{where}: every reading is the same, so the board or the library that reads it repeats one value. Check "
+            "that the library is started and that the chips answer, and record again."
+        )
+    return found
 
 
 @dataclass
@@ -319,9 +322,7 @@ def check_rows(
     """
     log = FaultLog(policy, where, "row")
     row = 1 + np.arange(len(b_uT)) if row is None else row
-    readings = reading_faults_of_table(b_uT, temperature_degC)
-    if is_frozen(b_uT[~readings.failed_rows]):
-        raise CaptureError(f"{where}: {FROZEN}")
+    readings = reading_faults_of_table(b_uT, temperature_degC, where)
     failed, out_of_range = log.record_readings(readings, row)
     read = ~readings.failed_rows
     if not read.any():

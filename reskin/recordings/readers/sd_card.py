@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from reskin.board import faults
 from reskin.errors import CaptureError
 from reskin.recordings import tables
-from reskin.recordings.fault_policy import FROZEN, reading_faults_of_table
+from reskin.recordings.fault_policy import reading_faults_of_table
 from reskin.recordings.tables import FIRST_ROW
 from reskin.recordings.units import check_fields
 
@@ -209,12 +209,10 @@ def _faults(
     row_n: Int64[np.ndarray, " f"],
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
-    failed = reading_faults_of_table(b_uT, temperature_degC).failed_rows
+    failed = reading_faults_of_table(b_uT, temperature_degC, where).failed_rows
     failed[~failed] = faults.lone_jumps(b_uT[~failed]).any(axis=1)
     if failed.all():
         raise CaptureError(f"{where}: in every line, the I2C read of a chip failed. Check the wiring, and log again.")
-    if faults.is_frozen(b_uT[~failed]):
-        raise CaptureError(f"{where}: {FROZEN}")
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))
