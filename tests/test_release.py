@@ -122,9 +122,7 @@ def test_imported_packages_are_declared():
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "markdown_it": "markdown-it-py"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
     required = {re.split(r"[\[<>=]", line)[0] for line in lines}
-    # These are packages of ROS 2, which pip cannot install.
-    of_ros = {"rclpy", "std_srvs", *(name for name in imported if name.endswith("_msgs"))}
-    assert {known.get(name, name) for name in imported - of_ros} <= required
+    assert {known.get(name, name) for name in imported} <= required
 
 
 def test_version_is_the_same_everywhere():

@@ -1,1 +1,1 @@
-"""Interfaces to the software that robots run: LeRobot datasets and sensors, and ROS 2."""
+"""Interfaces to the software that robots run: LeRobot datasets and sensors."""

@@ -2,18 +2,21 @@
 
 import json
 import re
+import runpy
 import shlex
 import shutil
 import sys
 from copy import copy
 from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 import reskin
 from reskin import cli
-from reskin.robots import ros2, sensor
+from reskin.live.tracker import Contact
+from reskin.robots import sensor
 from tests.stages.checkout import ROOT
 from tests.test_predicting import write_stream
 from tests.universal.skins import draw
@@ -78,10 +81,27 @@ def test_lerobot_example_of_the_page_records_an_episode(monkeypatch):
     np.testing.assert_array_equal(frames[0]["observation.skin"], np.arange(8))
 
 
-def test_ros_2_command_of_the_page_uses_only_parameters_of_the_node():
-    given = [word.partition(":=")[0] for word in command("python -m reskin.robots.ros2") if ":=" in word]
-    assert given
-    assert set(given) <= set(ros2.PARAMETERS)
+def test_ros_2_example_publishes_usable_contacts(monkeypatch):
+    nan_uT, node = np.full(15, np.nan), MagicMock()
+    contacts = [
+        Contact(12.5, 4.0, 6.0, 0.5, (0.1, 0.2), nan_uT, ()),
+        Contact(12.6, np.nan, np.nan, 0.0, (np.nan, np.nan), nan_uT, ()),
+        Contact(12.7, np.nan, np.nan, np.nan, (np.nan, np.nan), nan_uT, ("no data",), usable=False),
+    ]
+    packages = ("geometry_msgs", "geometry_msgs.msg", "rclpy", "rclpy.executors", "std_srvs", "std_srvs.srv")
+    modules = {name: MagicMock() for name in packages}
+    modules["rclpy"].create_node.return_value = node
+    modules["rclpy.executors"].ExternalShutdownException = InterruptedError
+    skin = MagicMock()
+    skin.__enter__.return_value = contacts
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(reskin, "open", lambda port: skin)
+    runpy.run_path(str(ROOT / "examples/ros2_node.py"), run_name="__main__")
+    assert node.create_publisher.return_value.publish.call_count == 3  # two forces and one place
+    assert modules["geometry_msgs.msg"].PointStamped.return_value.point.x == pytest.approx(0.004)
+    node.get_logger.return_value.warning.assert_called_once()
+    node.destroy_node.assert_called_once()
 
 
 def test_onnx_examples_of_the_page_export_and_run_a_model(tmp_path, monkeypatch):
