@@ -74,11 +74,6 @@ SIMULATED = (
     "State in the header of the capture that it is simulated. Use this option for a port of `reskin emulate`, because "
     "it cannot be distinguished from the port of a real board."
 )
-FAULT = (
-    "A fault to simulate: NAME[@START_S[+SECONDS]], such as stuck@8+2. By default, a fault begins after 3 s and lasts "
-    "1 s. The option can be repeated. Names: failed-read, zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, "
-    "magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
-)
 MODEL = (
     "A trained network, a universal model from `reskin model make` (.safetensors, with its JSON card), or a saved "
     "calibration. Give the option twice for a universal model and its calibration. Default: the universal model for "
@@ -291,7 +286,6 @@ def emulate(
             help="Speed relative to the speed of the source. With inf, frames are sent as fast as possible.", min=0.01
         ),
     ] = 1.0,
-    fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="After the last frame, start again with the first frame.")] = False,
     true_places: Annotated[
         bool, Option("--true-places", help="Print the true place and the true force of each simulated touch.")
@@ -301,16 +295,12 @@ def emulate(
 ) -> None:
     """Emulate a board: create a port, and send the frames of a capture or of a simulation through it.
 
-    Programs can read this port like the port of a real board. With --fault, faults of the board or of the port are
-    simulated too.
+    Programs can read this port like the port of a real board. Press Ctrl-C to unplug the board.
     """
-    from reskin.live.emulator import RobotLog, TouchPrinter, inject, make_port, parse_fault, play, read_script
+    from reskin.live.emulator import RobotLog, TouchPrinter, make_port, play, read_script
 
-    faults = [parse_fault(text) for text in fault or ()]
     _announce_simulation(source)
     script = read_script(source, board=board, robot=robot is not None)
-    for spec in faults:
-        script = inject(script, spec)
     listeners: list[Callable[[int], None]] = []
     if true_places:
         listeners.append(TouchPrinter(script, source, typer.echo))

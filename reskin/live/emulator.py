@@ -1,8 +1,7 @@
 """An emulated board: a process that sends the bytes that a real board would send.
 
 The bytes come from a recorded capture or from a simulation. They are sent to a pseudo-terminal or to a TCP socket,
-from which other programs read them as from a serial port. Faults can be added to the bytes, such as a chip that is
-stuck or a cable that is unplugged.
+from which other programs read them as from a serial port.
 """
 
 import os
@@ -14,24 +13,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from reskin import io
 from reskin.board.custom import CustomWire
-from reskin.board.faults import (
-    INT16_STEPS_N,
-    FAILED_B_uT,
-    FAILED_TEMPERATURE_degC,
-    RESET_LSB_XY_uT,
-    RESET_LSB_Z_uT,
-    find_lsb,
-)
 from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
@@ -40,7 +31,6 @@ from reskin.errors import CaptureError, ParamsError
 from reskin.recordings.header import HEADER_FILE, LOG_FILE, NAME, NAME_RULE, STREAM_FILE, Source
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
-from reskin.seeds import rng_for
 from reskin.simulation.capture import SimulatedCapture, list_captures, simulate_capture
 from reskin.simulation.defaults import SHARED, nominal
 from reskin.simulation.protocols import LIFTED_MM, Plan, Walk
@@ -61,24 +51,6 @@ ROBOT_RATE_HZ = 100.0
 # press.
 AT_REST = 0.999
 
-START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
-TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
-# Fault `crlf`: as a float32, this temperature contains the bytes 0D 0A, which also mark the end of a frame.
-CRLF_TEMPERATURE_degC = 34.513275
-FINEST_LSB_uT = (0.15, 0.242)  # along x and y, and along z; assumed if the LSB of a chip cannot be detected
-NEAR_END = 0.98  # fraction of the range at which fields of fault int16-wrap alternate
-MAGNET_uT = 400.0  # fault `magnet`: change of the field along z
-HOT_degC = 150.0  # fault `too-hot`: temperature
-CLOCK_JUMP_S = 3600.0  # fault `clock-jump`: change of the time
-# Fault `slow-chips`: each chip has a new reading only in every third frame, and the chips take turns.
-SLOW_FRAMES_N = 3
-VALUE_FAULTS = (
-    "failed-read", "zeros", "chip-reset", "stuck", "slow-chips", "saturated", "int16-wrap", "magnet", "too-hot", "crlf",
-    "clock-jump",
-)  # fmt: skip
-BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
-FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
-
 TICK_S = 0.1  # longest time until `play` notices that the event `stop` was set
 # Sending is blocked while the reader does not read. If it was blocked for longer than this time, all later frames are
 # delayed. If it was blocked for a shorter time, `play` sends the next frames faster until it has caught up.
@@ -97,8 +69,6 @@ class Script:
     frames: Frames  # the decoded frames
     pieces: list[bytes]  # the bytes of each frame
     t_s: Float64[np.ndarray, " f"]  # time at which each piece is due, from the start of the script
-    # maps the index of a piece to the time for which the board is unplugged before this piece is sent
-    unplugged_s: dict[int, float] = field(default_factory=dict)
     # True x_mm, y_mm and F_N in each frame, which are NaN in frames without contact. The value is None if the true
     # contacts are unknown, as for a recorded capture.
     true_contacts: Float64[np.ndarray, "f 3"] | None = None
@@ -266,109 +236,6 @@ def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
         return data.splitlines(keepends=True)
     size = record_type(wire, frames.temperature_degC.shape[1]).itemsize
     return [data[first : first + size] for first in range(0, len(data), size)]
-
-
-class Fault(NamedTuple):
-    """A fault that is added to a script."""
-
-    name: str
-    start_s: float  # time from the start of the script
-    duration_s: float
-
-
-def parse_fault(text: str) -> Fault:
-    """Parse the text of the option `--fault`: NAME, NAME@START_S or NAME@START_S+DURATION_S.
-
-    >>> parse_fault("stall@2.5+1")
-    Fault(name='stall', start_s=2.5, duration_s=1.0)
-    """
-    match = re.fullmatch(r"([a-z0-9-]+)(?:@(\d{1,6}(?:\.\d+)?)(?:\+(\d{1,6}(?:\.\d+)?))?)?", text)
-    if match is None or match[1] not in FAULTS:
-        raise ParamsError(
-            f"--fault: {repr(text)[:40]} is not a fault. Write NAME, NAME@START_S or NAME@START_S+DURATION_S, such as "
-            f"stuck@3+1, where NAME is one of {', '.join(FAULTS)}."
-        )
-    return Fault(match[1], float(match[2] or START_S), float(match[3] or DURATION_S))
-
-
-def inject(script: Script, fault: Fault) -> Script:
-    """Return a copy of the script in which a fault occurs.
-
-    A fault of a single chip affects chip 1. If the board has only one chip, the fault affects this chip.
-    """
-    inside = (script.t_s >= fault.start_s) & (script.t_s < fault.start_s + fault.duration_s)
-    if not inside.any():
-        raise ParamsError(
-            f"--fault: {fault.name} starts at {fault.start_s:g} s, but the source ends at {script.duration_s:.1f} s. "
-            f"Try: {fault.name}@0"
-        )
-    rows, first = np.flatnonzero(inside), int(inside.argmax())
-    if fault.name in ("stall", "unplug"):
-        later_s = script.t_s + fault.duration_s * (np.arange(len(script)) >= first)
-        unplugged_s = script.unplugged_s | ({first: fault.duration_s} if fault.name == "unplug" else {})
-        return replace(script, t_s=later_s, unplugged_s=unplugged_s)
-    if fault.name in VALUE_FAULTS:
-        frames = script.frames.where(inside)
-        _change_values(frames, fault.name, find_lsb(script.frames.b_uT))
-        changed = encode_pieces(frames, script.wire)
-    else:
-        changed = _change_bytes([script.pieces[i] for i in rows], fault.name)
-    pieces = list(script.pieces)
-    for i, piece in zip(rows, changed, strict=True):
-        pieces[i] = piece
-    return replace(script, pieces=pieces)
-
-
-def _change_values(frames: Frames, fault: str, lsb_uT: Float64[np.ndarray, "k 2"]) -> None:
-    """Change the values in the given frames as a fault would change them. The frames are changed in place."""
-    b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
-    chip_i = min(1, temperature_degC.shape[1] - 1)
-    end_uT = INT16_STEPS_N * np.where(np.isfinite(lsb_uT[chip_i]), lsb_uT[chip_i], FINEST_LSB_uT)[[0, 0, 1]]
-    match fault:
-        case "failed-read":
-            b_uT[:, chip_i], temperature_degC[:, chip_i] = FAILED_B_uT, FAILED_TEMPERATURE_degC
-        case "zeros":
-            b_uT[:], temperature_degC[:] = 0.0, 0.0
-        case "chip-reset":
-            step_uT = np.array([RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT])
-            b_uT[:, chip_i] = np.rint(b_uT[:, chip_i] / step_uT) * step_uT
-        case "stuck":
-            b_uT[:, chip_i], temperature_degC[:, chip_i] = b_uT[0, chip_i], temperature_degC[0, chip_i]
-        case "slow-chips":
-            frame_i, all_i = np.indices(temperature_degC.shape)
-            read_i = np.maximum(frame_i - (frame_i - all_i) % SLOW_FRAMES_N, 0)
-            b_uT[:], temperature_degC[:] = b_uT[read_i, all_i], temperature_degC[read_i, all_i]
-        case "saturated":
-            b_uT[:, chip_i] = end_uT * np.sign(b_uT[:, chip_i])
-        case "int16-wrap":
-            b_uT[::2, chip_i, 2] = NEAR_END * end_uT[2]
-            b_uT[1::2, chip_i, 2] = -NEAR_END * end_uT[2]
-        case "magnet":
-            # All chips measure the same change of Bz, because chips are rotated only about z.
-            b_uT[:, :, 2] += MAGNET_uT
-        case "too-hot":
-            temperature_degC[:, chip_i] = HOT_degC
-        case "crlf":
-            temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
-        case "clock-jump":
-            if np.isnan(frames.device_s).all():
-                raise ParamsError(
-                    "--fault: clock-jump needs a capture with a clock of the board. Use a capture in wire format "
-                    "binary-clock."
-                )
-            frames.device_s[:] += CLOCK_JUMP_S
-
-
-def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
-    """Return the bytes of the given frames, changed as a fault of the connection would change them."""
-    if fault == "repeated":
-        return [2 * piece for piece in pieces]
-    if fault == "dropped":
-        return [piece if i % 2 else b"" for i, piece in enumerate(pieces)]
-    if fault == "torn":
-        return [piece[:-TORN_BYTES_N] if i % TORN_EVERY_N == 0 else piece for i, piece in enumerate(pieces)]
-    rng = rng_for(0, "inject", fault)  # the remaining fault is `wrong-baud`: the bytes are random
-    return [rng.bytes(len(piece)) for piece in pieces]
 
 
 class EmulatedPort:
@@ -545,45 +412,26 @@ def play(
     -------
     The number of bytes that were sent.
     """
-    sent_n, start_s, replugged = 0, time.monotonic(), False
+    sent_n, start_s = 0, time.monotonic()
     while not stop.is_set():
         i = 0
         while i < len(script) and not stop.is_set():
-            if i in script.unplugged_s:
-                port.unplug()
-                stop.wait(script.unplugged_s[i])
-                port.plug_in()
-                replugged = True  # the script must not start again when the reader opens the port again
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
                 continue
             blocked_s = max(now_s - due_s - LATE_MAX_S, 0.0)
             start_s += blocked_s
-            first, i = i, _end_of_batch(script, i, (now_s - blocked_s) * speed)
+            overdue_n = int(np.searchsorted(script.t_s, (now_s - blocked_s) * speed, "right")) - i
+            first, i = i, i + min(max(overdue_n, 1), BATCH_MAX_N)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
             on_sent(i - 1)
-            if port.was_opened():
-                if loop and not replugged:
-                    i, start_s = 0, time.monotonic()
-                replugged = False
+            if port.was_opened() and loop:
+                i, start_s = 0, time.monotonic()
         if not loop:
             break
         start_s += script.duration_s / speed
     return sent_n
-
-
-def _end_of_batch(script: Script, first: int, script_s: float) -> int:
-    """Return the index after the last piece of the batch that is sent next.
-
-    The batch starts with the piece `first` and contains all pieces that are due at the time `script_s`. If the board is
-    to be unplugged before one of these pieces, the batch ends before this piece.
-    """
-    last = first + 1
-    end = min(len(script), first + BATCH_MAX_N)
-    while last < end and script.t_s[last] <= script_s and last not in script.unplugged_s:
-        last += 1
-    return last
 
 
 class EmulatedBoard:

@@ -12,9 +12,9 @@ from reskin import cli
 from reskin.board import find
 from reskin.board.rates import RateMeasurement, RateMeter, RepeatCounter, explain, find_limits, measure
 from reskin.board.stream import decode_all
-from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script
+from tests.live.faults import inject
 
 
 def recognise_at_due_times(script):
@@ -23,7 +23,7 @@ def recognise_at_due_times(script):
 
 
 def with_fault(name, *, wire="binary"):
-    return inject(make_script(pokes_n=0, wire=wire), parse_fault(f"{name}@0+99"))
+    return inject(make_script(pokes_n=0, wire=wire), f"{name}@0+99")
 
 
 def at_rate(rate_hz):

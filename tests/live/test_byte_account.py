@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.experiments.extremes.serial import decode_portions
-from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encode_pieces, inject
+from reskin.live.emulator import Script, encode_pieces
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
+from tests.live.faults import BYTE_FAULTS, VALUE_FAULTS, inject
 
 # A script has 8 parts (slots) of 12 frames each, at 400 Hz. Each slot except the last one contains one fault.
 SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0
@@ -48,9 +49,9 @@ def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generato
     return script, clean, finite.tolist(), rng
 
 
-def make_fault(name: str, slot_i: int, rng: np.random.Generator) -> Fault:
+def make_fault(name: str, slot_i: int, rng: np.random.Generator) -> str:
     first, frames_n = rng.integers(0, SLOT_FRAMES_N // 2), rng.integers(1, SLOT_FRAMES_N // 2)
-    return Fault(name, (slot_i * SLOT_FRAMES_N + first) / RATE_HZ, frames_n / RATE_HZ)
+    return f"{name}@{(slot_i * SLOT_FRAMES_N + first) / RATE_HZ}+{frames_n / RATE_HZ}"
 
 
 def with_nan(piece: bytes, wire: str) -> bytes:

@@ -9,9 +9,9 @@ from reskin import cli as commands
 from reskin.board import find
 from reskin.cli import with_default_simulation
 from reskin.errors import ParamsError
-from reskin.live.emulator import FAULTS, inject, parse_fault
 from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
 from tests.live.boards import make_script, plugged_in
+from tests.live.faults import inject
 
 NO_OPTIONS = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
 RATE_BYTES_S = 82 * 400
@@ -44,13 +44,13 @@ def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, caps
 
 def test_record_command_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
+    with plugged_in(inject(make_script(), "failed-read@0+99"), loop=True) as name:
         commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **NO_OPTIONS)
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
 def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
-    with plugged_in(inject(make_script(), parse_fault("slow-chips@0+99")), loop=True, speed=5) as name:
+    with plugged_in(inject(make_script(), "slow-chips@0+99"), loop=True, speed=5) as name:
         commands.record(port=name, seconds=3.0, out=tmp_path / "run1", **NO_OPTIONS)
     rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
     assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
@@ -72,12 +72,6 @@ def test_options_wire_and_chips_raise_without_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
             commands.record(None, seconds=0.5, out=tmp_path / "run1", **(NO_OPTIONS | options))
-
-
-def test_help_lists_all_faults():
-    assert all(f" {name}" in commands.FAULT for name in FAULTS)
-    default = parse_fault("stuck")
-    assert f"begins after {default.start_s:g} s and lasts {default.duration_s:g} s" in commands.FAULT
 
 
 def test_live_without_options_shows_all_boards(monkeypatch):

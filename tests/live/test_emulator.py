@@ -19,9 +19,7 @@ from reskin.live.emulator import (
     EmulatedBoard,
     RobotLog,
     TouchPrinter,
-    inject,
     make_port,
-    parse_fault,
     play,
     read_script,
 )
@@ -29,6 +27,7 @@ from reskin.recordings.header import LOG_FILE, Clock, write_capture
 from reskin.recordings.labels import DwellBuilder, SampleTable
 from reskin.recordings.readers.sd_card import render
 from tests.live.boards import RATE_HZ, make_script, write_script
+from tests.live.faults import inject
 from tests.recordings.headers import make_header
 from tests.stages.checkout import ROOT
 
@@ -133,15 +132,17 @@ def test_reader_that_pauses_then_receives_at_most_a_tenth_of_a_second_at_once(ti
 def test_link_to_an_emulated_board_returns_with_its_name_after_unplugging(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = make_port(str(link))
-    player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
+    player = threading.Thread(target=play, args=[SCRIPT, end, stop])
     with pytest.raises(OSError, match="returned no data|Input/output"), open_port(str(link), 115200) as device:
         player.start()
         while True:
-            read_waiting(device)
+            if read_waiting(device):
+                stop.set()
+                player.join()
+                end.unplug()
     assert not link.is_symlink()
     assert not link.exists()
-    stop.set()  # This ends the time for which the board is unplugged.
-    player.join()
+    end.plug_in()
     assert link.is_symlink()
     end.unplug()
 
@@ -200,7 +201,7 @@ class TestFaults:
             "too-hot",
             "crlf",
         ):
-            changed = inject(SCRIPT, parse_fault(f"{name}@0.5+0.25"))
+            changed = inject(SCRIPT, f"{name}@0.5+0.25")
             inside = (SCRIPT.t_s >= 0.5) & (SCRIPT.t_s < 0.75)
             differs = np.array([one != other for one, other in zip(changed.pieces, SCRIPT.pieces, strict=True)])
             assert not differs[~inside].any(), name
@@ -209,26 +210,11 @@ class TestFaults:
 
     def test_faults_that_drop_or_repeat_bytes_change_the_number_of_frames(self):
         def frames_n(name: str) -> int:
-            return len(
-                decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
-            )
+            return len(decode_all(b"".join(inject(SCRIPT, f"{name}@0.5+0.25").pieces), "binary", 5, name)[0])
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
         assert frames_n("torn") == len(SCRIPT) - 2 * 10  # The frame after each torn frame is lost, too.
-
-    def test_fault_clock_jump_raises_if_frames_have_no_clock(self):
-        with pytest.raises(ParamsError, match="needs a capture with a clock of the board"):
-            inject(
-                replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
-                parse_fault("clock-jump@0.5"),
-            )
-        assert len(inject(make_script(pokes_n=0, wire="binary-clock"), parse_fault("clock-jump@0.5"))) == len(SCRIPT)
-
-    @pytest.mark.parametrize("text", ["", "stick", "stuck@", "stuck@-1", "stuck@1+", "stuck@99", "stuck@1e9"])
-    def test_invalid_faults_are_refused(self, text):
-        with pytest.raises(ParamsError, match="--fault: "):
-            inject(SCRIPT, parse_fault(text))
 
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])

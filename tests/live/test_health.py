@@ -7,10 +7,10 @@ import pytest
 
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.wire import Frames
-from reskin.live.emulator import inject, parse_fault
 from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, READINGS_REPEAT, REPEATS_FRAMES_N, Health
 from reskin.recordings.fault_policy import override
 from tests.live.boards import make_script
+from tests.live.faults import inject
 
 SCRIPT = make_script(pokes_n=2)
 ALARMS = {
@@ -38,7 +38,7 @@ def inject_fault(name, wire="binary"):
     from reskin.live.emulator import Script
 
     duration_s = 4.0 if name == "chip-reset" else 1.5  # A reset of a chip lasts until the end of the script.
-    script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{duration_s}"))
+    script = inject(make_script(pokes_n=2, wire=wire), f"{name}@1.5+{duration_s}")
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))
     return Script("recorded", wire, frames, [b""] * len(frames), t_s)
@@ -133,7 +133,7 @@ def test_missing_frames_raise_the_alarm_that_the_board_is_slower_than_before():
 
 def test_frames_with_a_fault_are_invalid():
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
-        script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
+        script = inject(SCRIPT, f"{name}@0+0.05")
         assert script.pieces[0] != SCRIPT.pieces[0]
         assert not feed_once(decode_first_frames(script, BATCH_FRAMES_N))[:20].any(), name
         assert feed_once(decode_first_frames(script, BATCH_FRAMES_N))[20:].all(), name
@@ -172,7 +172,7 @@ def test_alarm_for_external_fields_is_raised_if_all_chips_change_equally():
 
 def test_fault_policy_decides_which_frames_are_valid():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
-        script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
+        script = inject(SCRIPT, f"{name}@0+0.05")
         frames = decode_first_frames(script, BATCH_FRAMES_N)
         for action, used in (("drop", False), ("flag", True), ("refuse", False)):
             health = started(override(LIVE_POLICY, [f"{fault}={action}"], "test"))

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from reskin import cli as commands
 from reskin.board import find
 from reskin.errors import CaptureError, ReskinError
-from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
+from tests.live.faults import inject
 
 CHUNK_N = 3  # Each chunk has the bytes of this number of frames, and starts in the middle of a frame.
 
@@ -45,7 +45,7 @@ def test_properties_of_a_board_are_detected_from_its_bytes(wire, chips_n, rate_h
 
 def test_devices_that_send_other_bytes_are_not_taken_for_boards():
     script = make_script(pokes_n=0)
-    wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
+    wrong_baud = chunks_of(inject(script, "wrong-baud@0+99"))
     assert "Check the baud rate" in str(find.recognise("port", wrong_baud))
     assert "no bytes arrived" in str(find.recognise("port", []))
     assert "cannot open the port" in str(find.detect_board("/dev/none"))

@@ -83,8 +83,8 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
-    capture, link = write_script(make_script(pokes_n=4), tmp_path / "c0"), tmp_path / "board"
-    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "crlf@1+1")
+    capture, link = write_script(inject(make_script(pokes_n=4), "crlf@1+1"), tmp_path / "c0"), tmp_path / "board"
+    board = shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)
 
     assert "binary, 5 chips, " in shell.run("ports", link)
@@ -105,27 +105,29 @@ def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
     assert "open http://localhost" in page.stdout.readline()  # The page waits for the board.
     assert f"skins are saved in {tmp_path / 'skins'}" in page.stdout.readline()
-    board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
-    asyncio.run(watch_page(f"http://localhost:{http_port}/live"))
+    board = shell.start("emulate", capture, "--port", link, "--loop")
+    asyncio.run(watch_page(f"http://localhost:{http_port}/live", board))
     page.send_signal(signal.SIGINT)
     assert page.wait(timeout=LONG_S) == 0
     assert f"{link}: no such port. The page waits for it." in page.stderr.read()
 
 
-async def watch_page(address: str) -> None:
-    """Wait until the page has received the expected alarms, and contacts at the right places."""
+async def watch_page(address: str, board: subprocess.Popen) -> None:
+    """Wait for contacts at the right places; then stop and unplug the board, and wait for the alarms."""
     async with aiohttp.ClientSession() as client, connect(client, address) as page:
         await until(page, lambda message: message.get("zeroed") is True)
-        alarms, near_n = "", 0
-        for _ in range(6000):
-            message = await until(page, lambda message: True)
-            alarms += " ".join(message.get("alarms", []))
-            if message.get("contact") == 1:
-                found = np.array([message["x_mm"], message["y_mm"], message["F_N"]])
-                near_n += int(np.abs(found - PLACES).max(axis=1).min() < 1.0)
-            if near_n >= 10 and "no data" in alarms and "unplugged" in alarms:
-                return
-        raise AssertionError(f"{near_n} messages had a poke near its place; alarms: {alarms[:500]}")
+        for _ in range(10):
+            await until(page, lambda message: message.get("contact") == 1 and is_near(message))
+        for signals, alarm in (((signal.SIGSTOP,), "no data"), ((signal.SIGCONT, signal.SIGINT), "unplugged")):
+            for each in signals:
+                board.send_signal(each)
+            await until(page, lambda message, alarm=alarm: alarm in " ".join(message.get("alarms", [])))
+
+
+def is_near(message: dict) -> bool:
+    """Return whether an estimate is near one of the two pokes."""
+    found = np.array([message["x_mm"], message["y_mm"], message["F_N"]])
+    return np.abs(found - PLACES).max(axis=1).min() < 1.0
 
 
 class connect:
@@ -165,9 +167,12 @@ def test_recording_of_a_killed_process_can_be_added(shell, tmp_path):
 
 def test_recording_is_complete_if_the_board_is_unplugged(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
-    shell.start("emulate", capture, "--port", link, "--loop", "--fault", "unplug@3+99")
+    board = shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)
-    assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
+    recorder, stream = shell.start("record", "--port", link, "--out", "run1"), tmp_path / "run1.part/stream.bin"
+    wait_until(lambda: stream.exists() and stream.stat().st_size > 8200)
+    board.send_signal(signal.SIGINT)
+    assert "(unplugged after" in recorder.communicate(timeout=LONG_S)[0]
     assert (tmp_path / "run1" / HEADER_FILE).is_file()
 
 
@@ -187,7 +192,6 @@ def test_invalid_options_are_errors_of_one_sentence(shell):
     assert "Traceback" not in errors
     for arguments, message in (
         (["nothing"], "must be the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
-        (["nothing", "--fault", "melted"], "stuck@3.1, where NAME is one of failed-read"),
     ):
         with pytest.raises(ReskinError, match=message):
             CliRunner().invoke(app, ["emulate", *arguments], catch_exceptions=False)

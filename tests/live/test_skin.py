@@ -16,7 +16,7 @@ import pytest
 import reskin
 from reskin.board.port import open_port
 from reskin.errors import ReskinError
-from reskin.live.emulator import inject, make_port, parse_fault, play
+from reskin.live.emulator import make_port, play
 from reskin.live.tracker import TAKING_NOLOAD, LiveSkin
 from reskin.models.trained import read_network
 from reskin.seeds import rng_for
@@ -29,6 +29,7 @@ from tests.live.boards import (
     plugged_in,
     write_model,
 )
+from tests.live.faults import inject
 
 SCRIPT = make_script(pokes_n=2)
 # On a busy machine, a healthy board may raise these alarms.
@@ -88,23 +89,24 @@ def test_slow_caller_receives_the_latest_reading(tmp_path):
 
 
 def test_readings_continue_after_alarms_for_pauses_and_unplugging(tmp_path):
-    script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
-    link, seen = str(tmp_path / "board"), []
-    with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
-        for contact in skin:
-            seen += [] if seen and seen[-1] == contact.alarms else [contact.alarms]
-            assert contact.usable == np.isfinite(contact.b_uT).all()
-            if any("unplugged" in alarm for alarms in seen for alarm in alarms) and contact.F_N > 0:
-                break
-    alarms_text = " ".join(alarm for alarms in seen for alarm in alarms)
-    assert "no data" in alarms_text
-    assert "unplugged" in alarms_text
+    script, link = inject(make_script(pokes_n=3), "stall@2.5+1"), str(tmp_path / "board")
+    awaited = ["no data", "unplugged"]
+    with ExitStack() as board:
+        board.enter_context(plugged_in(script, link, loop=True))
+        with reskin.open(link, model=write_model(tmp_path)) as skin:
+            for contact in skin:
+                assert contact.usable == np.isfinite(contact.b_uT).all()
+                if awaited and awaited[0] in " ".join(contact.alarms):
+                    if awaited.pop(0) == "no data":
+                        board.close()  # unplugs the board
+                    else:
+                        board.enter_context(plugged_in(script, link, loop=True))
+                if not awaited and contact.F_N > 0:
+                    break
 
 
 def test_frames_with_failed_reads_have_no_estimate(tmp_path):
-    skin, readings = play_to_skin(
-        inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))]
-    )
+    skin, readings = play_to_skin(inject(SCRIPT, "failed-read@1.7+0.5"), [read_network(write_model(tmp_path))])
     failed = [row for batch in readings for row in batch.target[batch.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
@@ -134,17 +136,17 @@ def test_bytes_without_frames_after_plugging_in_are_counted_as_lost(chunk_n):
 
 
 def test_magnet_raises_only_the_alarm_for_external_fields(tmp_path):
-    skin, _ = play_to_skin(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
+    skin, _ = play_to_skin(inject(SCRIPT, "magnet@3+1"), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 
 
 def test_no_load_reading_waits_until_the_skin_is_not_touched():
-    script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
+    script = inject(make_script(pokes_n=0, quiet_s=4.0), "magnet@0.35+0.7")
     skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
     # The tolerance is four standard errors of a mean of 100 readings with 3 uT of noise.
     np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))
-    moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
+    moving = inject(make_script(pokes_n=0, quiet_s=2.0), "magnet@0.35+0.7")
     assert not play_to_skin(moving)[0].zeroed
 
 
@@ -169,7 +171,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
     minutes_n = int(os.environ.get("RESKIN_MINUTES", "1"))
     script, rng = make_script(pokes_n=20), rng_for(0, "faults")
     for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
-        script = inject(script, parse_fault(f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}"))
+        script = inject(script, f"{fault}@{rng.uniform(3, 55):.2f}+{rng.uniform(0.1, 2):.2f}")
     end, stop, sent = make_port("pty"), threading.Event(), []
     player = threading.Thread(
         target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))

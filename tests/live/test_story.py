@@ -11,13 +11,14 @@ from ruamel.yaml import YAML
 from pipeline import plan
 from reskin import io
 from reskin.board.wire import Frames
-from reskin.live.emulator import Script, encode_pieces, inject, parse_fault
+from reskin.live.emulator import Script, encode_pieces
 from reskin.models.trained import read_network
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, STREAM_FILE, parse, seal
 from reskin.recordings.probe import ProbeLog
 from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ, play_to_skin, write_script
+from tests.live.faults import inject
 from tests.live.test_processes import Shell, wait_until
 from tests.stages.checkout import copy_checkout, warm_stages
 
@@ -83,11 +84,12 @@ def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path):
         YAML().dump(SCENE, stream)
     plan.use(root, [])
     with closing(Shell(root)) as shell:
-        shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", CRLF)
+        sent = inject(script, CRLF)
+        shell.start("emulate", write_script(sent, tmp_path / "c0"), "--port", link)
         wait_until(link.is_symlink)
         # This message means that the script has ended.
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
-        write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
+        write_punctual_arrivals(root / "run1", sent)
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
         shell.run("scenes", "use", "pressed")
     # tests/recordings/test_lab_story.py tests the report of a recorded scene.

@@ -17,10 +17,10 @@ from reskin.board.faults import GRID_ROWS_N, ConstantChannels, FaultDetector
 from reskin.board.stream import decode_all
 from reskin.board.wire import Frames, record_type
 from reskin.errors import CaptureError, ParamsError
-from reskin.live.emulator import inject, parse_fault
 from reskin.recordings.fault_policy import FaultLog, FaultPolicy, check_rows, override
 from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ, make_script
+from tests.live.faults import inject
 from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
@@ -50,7 +50,7 @@ def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy
 
 def record_fault(name: str, wire: str, policy: FaultPolicy = DEFAULT_POLICY):
     """Decode a stream with a fault in two chunks. Return the fault log and the mask of kept frames."""
-    script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
+    script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], f"{name}@{FROM_S}+{LASTS_S}")
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     sent_byte = np.cumsum([len(piece) for piece in script.pieces])
     t_s = np.interp(frames.end_byte, sent_byte, script.t_s)
@@ -92,7 +92,7 @@ def test_silence_of_more_than_a_second_counts_as_unplugging():
 
 
 def test_chip_with_power_on_settings_is_refused_or_flagged():
-    script = inject(make_script(pokes_n=2), parse_fault("chip-reset@2+5"))
+    script = inject(make_script(pokes_n=2), "chip-reset@2+5")
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     with pytest.raises(CaptureError, match="the LSB of chip 1"):
         record(frames, script.t_s, [], DEFAULT_POLICY)

@@ -13,10 +13,10 @@ import pytest
 
 import reskin
 from reskin.errors import ReskinError
-from reskin.live.emulator import inject, parse_fault
 from reskin.live.tracker import LiveSkin
 from reskin.robots.sensor import ESTIMATE, SkinConnectionError, SkinSensor, SkinSensorConfig
 from tests.live.boards import PLACES, POKE_S, QUIET_S, RATE_HZ, ScriptReader, make_script, plugged_in, write_model
+from tests.live.faults import inject
 
 QUIET_N, POKED_N = round(QUIET_S * RATE_HZ), round((QUIET_S + POKE_S) * RATE_HZ)
 FIELDS = [f"B{axis}{chip}_uT" for chip in range(5) for axis in "xyz"]
@@ -104,7 +104,7 @@ def test_async_read_returns_each_reading_only_once(gated):
 
 
 def test_async_read_returns_no_unusable_readings(gated):
-    sensor, reader = gated(inject(make_script(), parse_fault("failed-read@1.5+1")))
+    sensor, reader = gated(inject(make_script(), "failed-read@1.5+1"))
     with sensor:
         reader.wait()
         with suppress(TimeoutError):
