@@ -361,9 +361,9 @@ def live(
     from reskin.board.find import find_boards
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
+    from reskin.live.models import SkinFolder
     from reskin.live.server import serve
     from reskin.live.session import open_sessions
-    from reskin.live.skins import SkinFolder
     from reskin.predicting import read_models
     from reskin.recordings.fault_policy import override
     from reskin.recordings.recorder import CAPTURES

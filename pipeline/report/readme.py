@@ -71,7 +71,7 @@ def _read(file: Path) -> str:
 
 
 def measured_of(numbers: Mapping[str, Any], model_sha256: str) -> dict[str, Any]:
-    """Return the results of the shipped model that the live page shows (`reskin.live.used_model.Measured`).
+    """Return the results of the shipped model that the live page shows (`reskin.live.models`).
 
     Places are for presses at random places, with labels and tests on different colours of a checkerboard.
     """

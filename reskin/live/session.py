@@ -13,20 +13,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from reskin.board.custom import CustomWire
 from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
-from reskin.live.page_recording import LabelledPress, PageRecording
-from reskin.live.skins import SkinFolder
-from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
-from reskin.live.used_model import describe
+from reskin.live.models import Models, SkinFolder, UniversalEstimator
+from reskin.live.presses import GuidedPresses, LabelledPress, PageRecording, Presses
+from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, check_ports
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.labels import Label
-from reskin.seeds import rng_for
-from reskin.universal.layout import BoardLayout, paper_layout
 
 POLL_S = 0.1
 # If there are several boards, the frames of a board are collected for this time and then estimated together. This needs
@@ -48,12 +44,6 @@ HEAD = struct.Struct("<IHHd")
 # contact, the frame rate, the number of lost bytes, four latencies in ms, the number of dropped frames, and the true x,
 # y and F of an emulated board. The last three numbers are NaN for real boards, and while nothing touches the skin.
 NUMBERS_N = 17
-
-PRESSES_N = 12  # number of presses anywhere for a calibration
-# The places for guided presses form a square grid. These are their coordinates along x and along y, relative to the
-# board's centre and as fractions of half the width of the sensing area.
-GUIDED = 0.375 * np.array([-1.5, -0.5, 0.5, 1.5])
-READINGS_MIN_N = 4  # a contact with fewer readings is not counted as a press
 
 
 class Traces:
@@ -153,78 +143,7 @@ class Traces:
                 self.to_screen_s.append(now_s - t_s)
 
 
-class Presses:
-    """The presses that are collected for a calibration. For each press, the largest field change is stored."""
-
-    def __init__(self, presses_n: int = PRESSES_N) -> None:
-        self.presses_n = presses_n
-        self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
-        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change of the contact in progress
-        self._readings_n = 0
-
-    def __len__(self) -> int:
-        return len(self._strongest_uT)
-
-    @property
-    def complete(self) -> bool:
-        return len(self) >= self.presses_n
-
-    @property
-    def instruction(self) -> str:
-        """The text that tells the user which press is next, and where."""
-        return f"press {len(self) + 1} of {self.presses_n}, anywhere"
-
-    @property
-    def next_mm(self) -> list[float] | None:
-        """x and y in mm of the place that the user should press next; None if the user may press anywhere."""
-        return None
-
-    @property
-    def db_uT(self) -> Float64[np.ndarray, "n ch"]:
-        return np.array(self._strongest_uT)
-
-    def add(self, estimates: Estimates) -> None:
-        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a contact."""
-        known = np.isfinite(estimates.db_uT).all(axis=1)
-        for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
-            if contact:
-                self._readings_n += 1
-                if self._current_uT is None or np.linalg.norm(db_uT) > np.linalg.norm(self._current_uT):
-                    self._current_uT = db_uT
-                continue
-            if self._current_uT is not None and self._readings_n >= READINGS_MIN_N and not self.complete:
-                self._strongest_uT.append(self._current_uT)
-            self._current_uT, self._readings_n = None, 0
-
-
-class GuidedPresses(Presses):
-    """The presses that are collected at places of a grid. The page shows these places one by one in random order.
-
-    Every second press is held out: it is not used for the calibration, but to measure the error of the calibrated
-    model.
-    """
-
-    def __init__(self, board: BoardLayout | None = None) -> None:
-        board = board or paper_layout()
-        grid_mm = (
-            np.array(board.centre_mm) + np.stack(np.meshgrid(GUIDED, GUIDED), axis=-1).reshape(-1, 2) * board.half_mm
-        )
-        self.place_mm = rng_for(0, "shown places").permutation(grid_mm)
-        super().__init__(len(self.place_mm))
-
-    @property
-    def instruction(self) -> str:
-        return f"press {len(self) + 1} of {self.presses_n}, at the cross"
-
-    @property
-    def next_mm(self) -> list[float] | None:
-        return None if self.complete else self.place_mm[len(self)].tolist()
-
-    @property
-    def held_out(self) -> Bool[np.ndarray, " n"]:
-        return np.arange(self.presses_n) % 2 == 1
-
-
+CHANGES_MAX_N = 4  # largest number of requested changes of the model that wait
 ADAPTING = ("adapt", "places")  # names of the buttons that start the collection of presses
 # Limits of the labels that the user enters. They are so large that only labels in a wrong unit exceed them.
 PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0
@@ -263,12 +182,12 @@ class Session:
         wire: CustomWire | None = None,
     ) -> None:
         self.skin, self.source = LiveSkin(port, models, fault_policy=fault_policy, wire=wire), source
-        self._models, self._model_name = models, model_name
-        self._alone, self._emulated, self._skins = alone, emulated, skins or SkinFolder()
+        self._model_name, self._alone, self._emulated, self._skins = model_name, alone, emulated, skins or SkinFolder()
         self.traces: Traces | None = None
         self._error = ""
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
+        self._doubtful_press: LabelledPress | None = None  # contradicts the model; the user may keep or discard it
         self._guided_press: LabelledPress | None = None  # the guided press in progress, whose label will be recorded
         self._adapted = self._labelled = ""  # texts for the user about the last calibration and the last labelled press
         self._recording: PageRecording | None = None
@@ -316,8 +235,8 @@ class Session:
             self._error = f"estimation stopped: {error!r}"
 
     def _change_model(self) -> None:
-        """Make the changes of the model that the page has requested, such as loading a saved skin."""
-        while self._changes:
+        """Make a change of the model that the page has requested, such as loading a saved skin."""
+        if self._changes:
             change, estimator = self._changes.popleft(), self.skin.estimator
             try:
                 if not isinstance(estimator, UniversalEstimator):
@@ -389,6 +308,19 @@ class Session:
         press.add(estimates)
         if not press.complete or press.db_uT is None:
             return
+        estimator, doubt = self.skin.estimator, ""
+        if press.learn and isinstance(estimator, UniversalEstimator):
+            doubt = estimator.contradiction((press.label.x_mm, press.label.y_mm), press.db_uT)
+        with self._button_lock:
+            if self._labelled_press is not press:  # the user has cancelled the label
+                return
+            self._labelled_press, self._doubtful_press = None, press if doubt else None
+            self._labelled = f"press {_place(press.label)}: {doubt}"
+        if not doubt:
+            self._use_label(press)
+
+    def _use_label(self, press: LabelledPress) -> None:
+        """Write a label to the recording, and calibrate the model to the press."""
         done, estimator = [], self.skin.estimator
         with self._button_lock:
             try:
@@ -397,14 +329,18 @@ class Session:
                     done.append(f"recorded as labelled press {self._recording.touches_n}")
             except (ReskinError, OSError) as error:
                 done.append(str(error))
-            if self._labelled_press is press:
-                self._labelled_press = None
-        if press.learn and isinstance(estimator, UniversalEstimator):
+        if press.learn and press.db_uT is not None and isinstance(estimator, UniversalEstimator):
             try:
                 done.append(estimator.add_label((press.label.x_mm, press.label.y_mm), press.label.Fz_N, press.db_uT))
             except ReskinError as error:
                 done.append(f"not used for calibration: {error}")
         self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'neither recorded nor used'}"
+
+    def _use_doubtful_label(self, _: UniversalEstimator) -> str:
+        press, self._doubtful_press = self._doubtful_press, None
+        if press is not None:
+            self._use_label(press)
+        return self._adapted
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Return the next binary message for the page, and the number of the newest bin.
@@ -431,6 +367,11 @@ class Session:
         """
         skin, detected, presses = self.skin, self.skin.detected, self._presses
         recording, press, traces = self._recording, self._labelled_press, self.traces
+        alarms = [self._error, *skin.alarms()]
+        if self._doubtful_press is not None:
+            alarms.append(self._labelled)
+        if recording is not None and skin.reader.writer_problem:
+            alarms.append(f"recording {recording.folder} {skin.reader.writer_problem}")
         state: dict[str, Any] = {
             "what": self.source if self._alone else str(self), "zeroed": skin.zeroed,
             "adaptable": isinstance(skin.estimator, UniversalEstimator),
@@ -438,27 +379,27 @@ class Session:
             "next_mm": presses.next_mm if presses is not None else None,
             "adapted": self._adapted,
             "waiting": detected.problem is not None, "silent": skin.silent,
-            "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
-            "recording": f"{recording.folder} {skin.reader.writer_problem}".strip() if recording else "",
+            "alarms": [alarm for alarm in alarms if alarm not in ("", WAITING)],
+            "recording": str(recording.folder) if recording else "",
             "recorded": self._recorded,
             "labelling": "" if press is None else _waiting_for(press),
             "label_mm": None if press is None else [press.label.x_mm, press.label.y_mm],
-            "labelled": self._labelled,
+            "labelled": self._labelled, "doubtful": self._doubtful_press is not None,
             "skins": self._skins.names(), "skins_folder": str(self._skins.folder),
             "true_places": self._emulated is not None and self._emulated.has_true_contacts,
             "zeroings_n": skin.zeroings_n,
             "zero_bins": [] if traces is None else traces.bins_of(tuple(skin.zeroings_s)),
-            **describe(skin.estimator, self._models, self._model_name),
+            **({} if skin.estimator is None else skin.estimator.describe(self._model_name)),
         }  # fmt: skip
         if recording:
             state["recording_n"] = recording.touches_n
         if detected.problem is None:
-            layout, alarms = skin.layout, list(skin.health.alarms.values())
+            layout = skin.layout
             state |= {
                 "board": skin.description,
                 "seen": [
                     [alarm.name, alarm.count_n, round(alarm.last_s - alarm.first_s, 1), alarm.action]
-                    for alarm in alarms
+                    for alarm in list(skin.health.alarms.values())
                 ],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,
@@ -487,9 +428,9 @@ class Session:
         self.press(message.get("press"))
         self.confirm(message.get("seen"))
         if "save" in message:
-            self._changes.append(partial(self._save, name=message["save"]))
+            self._request_change(partial(self._save, name=message["save"]))
         if "load" in message:
-            self._changes.append(partial(self._load, name=message["load"]))
+            self._request_change(partial(self._load, name=message["load"]))
         if "label" in message:
             with self._button_lock:
                 try:
@@ -503,17 +444,29 @@ class Session:
             if button == "zero":
                 self.skin.zero()
             elif button == "undo":
-                self._changes.append(UniversalEstimator.undo)
+                self._request_change(UniversalEstimator.undo)
             elif button == "refine":
-                self._changes.append(UniversalEstimator.refine)
+                self._request_change(UniversalEstimator.refine)
+            elif button == "keep":
+                self._request_change(self._use_doubtful_label)
+            elif button == "discard" and self._doubtful_press is not None:
+                self._labelled = f"discarded: press {_place(self._doubtful_press.label)}"
+                self._doubtful_press = None
             elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
                 requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
                 self._presses = requested if self._presses is None else None
-                self._labelled_press = self._guided_press = None
+                self._labelled_press = self._doubtful_press = self._guided_press = None
             elif button == "record" and self._recording is not None:
                 self._end_recording()
             elif button == "record" and self.skin.detected.problem is None:
                 self._begin_recording()
+
+    def _request_change(self, change: Callable[[UniversalEstimator], str]) -> None:
+        """Let the thread that polls the board change the model, unless too many changes are waiting."""
+        if len(self._changes) < CHANGES_MAX_N:
+            self._changes.append(change)
+        else:
+            self._adapted = f"not done, because {CHANGES_MAX_N} changes of the model are waiting already; try again"
 
     def _save(self, estimator: UniversalEstimator, *, name: object) -> str:
         return self._skins.save(name, estimator.model)
@@ -533,7 +486,7 @@ class Session:
             If the label is invalid, if it would be neither recorded nor used for calibration, or if other presses are
             being collected.
         """
-        self._labelled_press, self._labelled = None, ""
+        self._labelled_press, self._doubtful_press, self._labelled = None, None, ""
         if label is None:
             return
         if not isinstance(label, dict):

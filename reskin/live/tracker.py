@@ -11,19 +11,16 @@ For a `LiveSkin`, the bytes are decoded and the contacts are estimated in the co
 import threading
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
-from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from reskin.board import find
@@ -39,15 +36,13 @@ from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
+from reskin.live.models import Models, NetworkEstimator, UniversalEstimator
 from reskin.logs import quiet_start
-from reskin.models.inputs import VIEW, Scaler
-from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
-from reskin.universal.calibration import check_presses
 from reskin.universal.layout import BoardLayout
-from reskin.universal.model import MISFIT_MAX, Estimate, Universal
+from reskin.universal.model import Universal
 
 NOLOAD_S = 1.0  # the no-load reading is the mean of the readings in this time, during which nothing touches the skin
 NOLOAD_FRAMES_MAX_N = 10_000  # the no-load reading ends earlier if this number of frames has arrived
@@ -60,281 +55,11 @@ OPENING_S = 10.0  # longest time after opening a port for the detection of the w
 ENDS_KEPT_N = 256
 FRAME_BYTES_MIN_N = 16  # smallest number of bytes per chip in a frame, among all wire formats
 SPACING_MM = 5.0  # distance between chips on the page if their positions are unknown
-# A reading is outside a network's training distribution if one of the network's inputs is larger than this number of
-# standard deviations of the training data. The value is assumed. For models that were trained in the same scene, the
-# largest observed input is 6 in scene `quick` and 7 in scene `lab`.
-UNKNOWN_SDS = 10.0
-UNDO_MAX_N = 100  # largest number of calibration steps that can be undone
 ZEROINGS_KEPT_N = 16  # number of latest no-load readings whose times are stored, to mark them on the page
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
 UNKNOWN_SKIN = "unknown skin: the model was not trained on such field changes"
-
-# The model that estimates contacts. If it is an empty sequence of networks, no place and no force is estimated.
-Models = Sequence[Network] | Universal
-
-
-class Prediction(NamedTuple):
-    """The predictions of a model for f readings that were taken during contact."""
-
-    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm and F_N
-    sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
-    sd_F_N: Float64[np.ndarray, " f"]  # standard deviation of the force; NaN if unknown
-    unknown: Bool[np.ndarray, " f"]  # whether a reading is outside the model's training distribution
-
-
-class NetworkEstimator:
-    """An estimator that uses one or more trained networks.
-
-    The prediction is the mean of the networks. Its uncertainty is the standard deviation between the networks.
-    """
-
-    def __init__(self, networks: Sequence[Network]) -> None:
-        self.channels_n: int = networks[0].card["input"]["channels_n"]
-        self.name = f"{len(networks)} network{'s' if len(networks) > 1 else ''}"
-        self._networks = networks
-        self._inputs = [
-            (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
-        ]
-        # Each network predicts once here, so that torch is imported and the network is built before the first contact.
-        for network in networks:
-            network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
-
-    def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Do nothing, because networks use only field changes and not the no-load reading."""
-
-    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
-        targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
-        sd = targets.std(axis=0, ddof=1) if len(targets) > 1 else np.full((len(db_uT), 3), np.nan)
-        inputs_sds = np.stack([np.abs(scaler.encode(view(db_uT))).max(axis=1) for view, scaler in self._inputs])
-        unknown = np.asarray((inputs_sds > UNKNOWN_SDS).any(axis=0))
-        return Prediction(targets.mean(axis=0), sd[:, :2], sd[:, 2], unknown)
-
-
-class Labels(NamedTuple):
-    """The labels and the field changes of m presses at known places."""
-
-    place_mm: Float64[np.ndarray, "m 2"]
-    force_N: Float64[np.ndarray, " m"]  # NaN if the force is unknown
-    db_uT: Float64[np.ndarray, "m ch"]
-
-    def followed_by(self, other: "Labels") -> "Labels":
-        return Labels(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
-
-
-class LearningState(NamedTuple):
-    """The calibration data of a `UniversalEstimator` after one calibration step, except for the no-load reading."""
-
-    origin: Universal  # the model before the calibration, which was passed to the estimator or loaded from a file
-    origin_name: str  # the name of the saved skin that was loaded; empty if none was loaded
-    presses_uT: Float64[np.ndarray, "n ch"]  # field changes of presses at unknown places
-    guided: Labels  # presses at places that the page showed
-    typed: Labels  # presses whose places the user entered
-    step: str  # description of the calibration step, such as "the 12 presses"
-    refined: Mapping[str, np.ndarray] = MappingProxyType({})  # weights of the network, if it was refined on the page
-
-    @property
-    def labels(self) -> Labels:
-        return self.guided.followed_by(self.typed)
-
-    @classmethod
-    def start(cls, origin: Universal, origin_name: str = "", step: str = "") -> "LearningState":
-        """Return the state of a model that has not yet been calibrated to presses on the page."""
-        none_uT = np.zeros((0, origin.channels_n))
-        none = Labels(np.zeros((0, 2)), np.zeros(0), none_uT)
-        return cls(origin, origin_name, none_uT, none, none, step)
-
-
-class UniversalEstimator:
-    """An estimator that uses a universal model, and calibrates it to the skin while the board is running.
-
-    The estimator calibrates a copy of the model. The model that was passed is not changed. The calibration uses the
-    no-load reading, presses at unknown places (`adapt`) and presses at known places (`label` and `add_label`). If
-    `adapt` or `label` is called again, the new presses replace those of the earlier call, so that the user can repeat
-    bad presses. `undo` reverts the last calibration step.
-    """
-
-    name = "universal model"
-
-    def __init__(self, model: Universal) -> None:
-        self.channels_n, self.board = model.channels_n, model.layout
-        # Until `set_noload` is called, the no-load field is that of the model, or zero if the model has none.
-        self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
-        # The last state is the current one. The earlier states are stored so that `undo` can return to them.
-        self._states = [LearningState.start(model)]
-        self._use(self._states[0])
-
-    @property
-    def learnt(self) -> LearningState:
-        """The current calibration data of the model."""
-        return self._states[-1]
-
-    @property
-    def undoable(self) -> bool:
-        """Whether there is a calibration step that `undo` can revert."""
-        return len(self._states) > 1
-
-    @property
-    def model(self) -> Universal:
-        """The calibrated model."""
-        return self._model
-
-    @property
-    def external_uT(self) -> float:
-        """Expected size of external fields, such as the field of a magnet; 0 if no external fields are expected."""
-        return self._model.external_uT
-
-    def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
-        """Return the matrix that removes external fields from readings (see `Universal.suppressor`)."""
-        return self._model.suppressor(noise_uT)
-
-    def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Set the no-load field to the mean of f readings without contact, and repeat the calibration with it."""
-        self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-        self._use(self.learnt)
-
-    def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to the field changes of presses at unknown places.
-
-        Returns
-        -------
-        A text for the user: the standard deviation of places, before and after the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If no press changes the field. The calibration is then unchanged.
-        """
-        check_presses(db_uT)
-        before = self._estimate(db_uT)
-        step = f"calibration to {len(db_uT)} presses"
-        self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=step))
-        after = self._estimate(db_uT)
-        sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
-        return (
-            f"adapted to {len(db_uT)} presses: median standard deviation of the places {sd_mm[0]:.2f} mm before, "
-            f"{sd_mm[1]:.2f} mm after"
-        )
-
-    def label(
-        self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
-    ) -> str:
-        """Calibrate to presses at known places, except for presses that are held out to measure the error.
-
-        The forces of the presses were not measured.
-
-        Returns
-        -------
-        A text for the user: the median error of the place at held-out presses, before and after the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If no press changes the field. The calibration is then unchanged.
-        """
-        check_presses(db_uT[~held_out])
-
-        def error_mm() -> float:
-            estimated_mm = self._estimate(db_uT[held_out]).place_mm
-            return float(np.median(np.linalg.norm(estimated_mm - place_mm[held_out], axis=1)))
-
-        before_mm, kept_n = error_mm(), int((~held_out).sum())
-        guided = Labels(place_mm[~held_out], np.full(kept_n, np.nan), db_uT[~held_out].astype(np.float64))
-        self._learn(self.learnt._replace(guided=guided, step=f"calibration to {kept_n} presses at known places"))
-        return (
-            f"adapted to {kept_n} known places: median error at {held_out.sum()} other places "
-            f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
-        )
-
-    def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
-        """Calibrate to one more press, whose place and, if it was measured, force are known.
-
-        A force of NaN means that the force is unknown.
-
-        Returns
-        -------
-        A text for the user: the errors of the place and the force of this press before the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If the field does not change, the place is not on the skin, or the force is out of the model's range. The
-            calibration is then unchanged.
-        """
-        check_presses(db_uT[None])
-        before = self._estimate(db_uT[None])
-        one = Labels(np.array([place_mm], float), np.array([force_N]), db_uT[None].astype(np.float64))
-        typed = self.learnt.typed.followed_by(one)
-        self._learn(self.learnt._replace(typed=typed, step="calibration to the last labelled press"))
-        error_mm = float(np.linalg.norm(before.place_mm[0] - one.place_mm[0]))
-        forces = "" if np.isnan(force_N) else f", force {before.force_N[0]:.2f} N instead of {force_N:.2f} N"
-        return f"calibrated to a labelled press; before, the error of its place was {error_mm:.2f} mm{forces}"
-
-    def refine(self) -> str:
-        """Train the network further on the labelled presses (see `Universal.refine`); return a text for the user.
-
-        Raises
-        ------
-        SchemaError
-            If there are too few labels with known forces. The calibration is then unchanged.
-        """
-        refined = copy(self._model).refine()
-        data = refined.skin.data
-        self._learn(self.learnt._replace(refined=data.refined, step="refinement of the network"))
-        return f"refined the network on {len(data.labels)} labelled presses; button Undo reverts it"
-
-    def load(self, file: Path) -> str:
-        """Replace all calibration data by a saved calibration; return a text for the user.
-
-        Raises
-        ------
-        SchemaError
-            If the file does not exist, is damaged, is not a saved calibration, or is for another kind of board. The
-            calibration is then unchanged.
-        """
-        if not file.is_file():  # for example, because another program deleted the file after the page had listed it
-            raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
-        origin = copy(self.learnt.origin).remember(file)
-        self._learn(LearningState.start(origin, file.stem, f"loading of skin {file.stem}"))
-        return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
-
-    def undo(self) -> str:
-        """Revert the last calibration step; return a text for the user."""
-        if not self.undoable:
-            return "nothing to undo: the model has not been calibrated on this page"
-        step = self._states.pop().step
-        self._use(self.learnt)
-        return f"undone: {step}"
-
-    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
-        b_uT = db_uT + self._noload_uT
-        estimate, misfit = self._model.estimate(b_uT), self._model.misfit(b_uT)
-        target = np.column_stack([estimate.place_mm, estimate.force_N])
-        return Prediction(target, estimate.sd_mm, estimate.sd_N, np.asarray(misfit > MISFIT_MAX))
-
-    def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        return self._model.estimate(db_uT + self._noload_uT)
-
-    def _learn(self, state: LearningState) -> None:
-        """Calibrate the model with the data of a new state, and keep the previous state for `undo`.
-
-        If the calibration fails, the previous state stays in use.
-        """
-        self._use(state)
-        self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
-
-    def _use(self, state: LearningState) -> None:
-        model = copy(state.origin).zero(self._noload_uT, keep=True)
-        if len(state.presses_uT):
-            model.see(state.presses_uT + self._noload_uT)
-        place_mm, force_N, db_uT = state.labels
-        if len(force_N):
-            model.label(place_mm, force_N, db_uT + self._noload_uT, keep=True)
-        if state.refined:
-            model.use_refined(state.refined)
-        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so it is made before the first contact
-        self._model, self.warnings = model, model.warnings
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
@@ -715,12 +440,12 @@ class LiveSkin:
             # The times of the frames are assumed to be evenly spaced. Their arrival times cannot be used, because all
             # frames of a chunk have the same arrival time.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
-            if self.estimator is not None:
-                self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
+            if self.estimator is not None:
+                self.estimator.set_noload(noload_uT)
             db_uT = b_uT - noload_uT
             if isinstance(self.estimator, UniversalEstimator):
-                self._suppressor = self.estimator.suppressor(noise_uT(db_uT))
+                self._suppressor = self.estimator.model.suppressor(noise_uT(db_uT))
             self._contact_uT = contact_threshold_uT(db_uT, self._suppressor)
             self.noload_uT = noload_uT
             self.zeroings_n += 1
@@ -739,7 +464,7 @@ class LiveSkin:
                 target[contact], sd_mm[contact], sd_F_N[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
-            expected_uT = self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
+            expected_uT = self.estimator.model.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
             self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], expected_uT)
         return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, sd_F_N, contact)
 

@@ -412,16 +412,16 @@ class Universal:
         self._set(replace(self._skin.data, rest_uT=rest_uT) if kept else SkinData.at_rest(rest_uT))
         return self
 
-    def see(self, b_uT: Float[np.ndarray, "*n ch"]) -> "Universal":
+    def see(self, b_uT: Float[np.ndarray, "*n ch"], *, changes: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
         Use dozens of presses all over the skin, in one or several calls. If there are labels, the widths of intervals
         and the correction of forces stay as they are until the next call of `label`.
 
         b_uT : fields as the board sends them. They are not field changes, because this method subtracts the no-load
-        reading.
+        reading, unless `changes` is set.
         """
-        db_uT = self._check_change("see", check_readings(b_uT, self.channels_n))
+        db_uT = self._check_change("see", check_readings(b_uT, self.channels_n), changes)
         self._set(self._skin.data.and_seen(db_uT), self._skin.judge if self.labels_n else None)
         return self
 
@@ -432,6 +432,7 @@ class Universal:
         b_uT: Float[np.ndarray, "*m ch"],
         *,
         keep: bool = False,
+        changes: bool = False,
     ) -> "Universal":
         """Calibrate to one or several labelled presses, which have known places and known forces.
 
@@ -444,6 +445,7 @@ class Universal:
         force_N : forces of the presses; None, or NaN for a press, if only the place is known
         b_uT : fields as the board sends them, one reading per press
         keep : whether earlier labels are kept. By default, they are discarded.
+        changes : whether `b_uT` contains field changes, from which no no-load reading is subtracted
 
         Raises
         ------
@@ -455,7 +457,8 @@ class Universal:
         forces = np.full(len(readings_uT), np.nan) if force_N is None else np.asarray(force_N, float)
         places_mm, forces_N = check_labels(np.asarray(place_mm, float), forces, len(readings_uT), self.reach_mm)
         check_range(forces_N, self.layout.force_N)
-        labels = LabelledPresses(places_mm - self._centre_mm, forces_N, self._check_change("label", readings_uT))
+        db_uT = self._check_change("label", readings_uT, changes)
+        labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT)
         data = self._skin.data if keep else self._skin.data.unrefined()
         if keep:
             labels = labels.joined_to(data.labels)
@@ -497,20 +500,23 @@ class Universal:
         estimate = self.estimate(b_uT)
         return np.column_stack([estimate.place_mm, estimate.force_N])
 
-    def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
+    def estimate(self, b_uT: Float[np.ndarray, "*f ch"], *, changes: bool = False) -> Estimate:
         """Estimate places and forces with their standard deviations, and whether anything touches the skin.
+
+        With `changes`, `b_uT` contains field changes, from which no no-load reading is subtracted.
 
         Contact is unknown if `zero` got fewer than `QUIET_MIN_N` readings, or if external fields are expected. Without
         contact, place and force mean nothing.
         """
-        db_uT = self._change(b_uT)
+        db_uT = self._change(b_uT, changes)
         estimate, known = self._skin.estimate(db_uT), self._contact_uT is not None and not self.external_uT
         contact = np.linalg.norm(db_uT, axis=1) > self._contact_uT if known else None
         return replace(estimate, place_mm=estimate.place_mm + self._centre_mm, contact=contact)
 
-    def misfit(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, " f"]:
+    def misfit(self, b_uT: Float[np.ndarray, "*f ch"], *, changes: bool = False) -> Float[np.ndarray, " f"]:
         """Return how unlike those of simulated skins readings in contact are: above `MISFIT_MAX`, they are unusual."""
-        return self.likeness.misfit(network.sign_of(self.weights, self._skin.data.rest_uT) * self._change(b_uT))
+        sign = network.sign_of(self.weights, self._skin.data.rest_uT)
+        return self.likeness.misfit(sign * self._change(b_uT, changes))
 
     def save(self, file: Path | str) -> None:
         """Write what is known of this skin to a file; `load_universal(file)` restores the calibrated model from it.
@@ -554,23 +560,26 @@ class Universal:
 
         The project's trained networks can be called in the same way.
         """
-        return self.predict(check_shape(db_uT, self.channels_n) + self.noload_uT).astype(np.float32)
+        found = self.estimate(db_uT, changes=True)
+        return np.column_stack([found.place_mm, found.force_N]).astype(np.float32)
 
-    def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Subtract the no-load reading from readings, and return the field changes along the board's axes.
+    def _change(self, b_uT: Float[np.ndarray, "*f ch"], changes: bool = False) -> Float[np.ndarray, "f ch"]:
+        """Return the field changes along the board's axes, from readings or from changes along the chips' axes.
 
         Raises SchemaError if `zero` has not been called yet.
         """
-        return (check_shape(b_uT, self.channels_n) - self.noload_uT) @ self._board_from_chips
+        baseline_uT = 0.0 if changes else self.noload_uT
+        return (check_shape(b_uT, self.channels_n) - baseline_uT) @ self._board_from_chips
 
-    def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
+    def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"], changes: bool) -> Float[np.ndarray, "f ch"]:
         """Return the field changes of presses along the board's axes.
 
         Raises SchemaError if the values are probably in another unit, or if they are field changes instead of readings.
         `where` is the name of the calling method, for the error message.
         """
-        db_uT = check_presses(self._change(b_uT))
-        check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
+        db_uT = check_presses(self._change(b_uT, changes))
+        if not changes:
+            check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
         return db_uT
 
     def _set(self, data: SkinData, judged: Judge | None = None) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 from reskin import io
 from reskin.board.wire import Frames, Wire
 from reskin.live.emulator import Script, encode_pieces, make_port, play
-from reskin.live.tracker import Estimates, LiveSkin, Models
+from reskin.live.models import Models
+from reskin.live.tracker import Estimates, LiveSkin
 from reskin.models.network import draw_weights, paper_layers
 from reskin.recordings import clocks
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture

@@ -12,7 +12,8 @@ from sklearn.neural_network import MLPRegressor
 import reskin
 from reskin.board.wire import Frames
 from reskin.live.emulator import encode_pieces
-from reskin.live.tracker import LiveSkin, Models
+from reskin.live.models import Models
+from reskin.live.tracker import LiveSkin
 from reskin.models.inputs import Scaler, fit_standard
 from reskin.models.trained import Network
 from reskin.seeds import rng_for

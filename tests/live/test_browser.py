@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 
 from reskin.live.emulator import playing
-from reskin.live.session import PRESSES_N
-from reskin.live.skins import SkinFolder
+from reskin.live.models import SkinFolder
+from reskin.live.presses import PRESSES_N
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
@@ -211,11 +211,20 @@ def test_calibrations_can_be_saved_loaded_and_undone_on_the_page(tmp_path, rando
         await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
         await tab.look("true", "boards[0].last.contact && !isNaN(boards[0].last.trueX)")
 
-        await tab.value(f"{CLICK}(3.5, 12)")
+        x_mm, y_mm = place_mm[0]
+        wrong_mm = x_mm, y_mm + (8.3 if y_mm < 8 else -8.3)
+        await tab.value(f"{CLICK}({wrong_mm[0]}, {wrong_mm[1]})")
+        await tab.value("boards[0].parts.label.click()")
+        await tab.until("!boards[0].parts.doubt.hidden")
+        assert "8." in str(await tab.value("boards[0].state.alarms.join()"))
+        await tab.look("doubt")
+        await tab.value("boards[0].parts.discard.click()")
+        await tab.until("boards[0].parts.doubt.hidden && boards[0].state.labelled.startsWith('discarded')")
+        await tab.value(f"{CLICK}({x_mm}, {y_mm})")
         typed = "[boards[0].parts.x.value, boards[0].parts.y.value].map(Number)"
         found_mm = await tab.until(typed, lambda values: values != [0, 0])
         # The tolerance is in mm. A pixel is 0.05 mm wide, and values are shown with one decimal.
-        assert np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
+        assert np.abs(np.array(found_mm) - place_mm[0]).max() < 0.15
         await tab.value("boards[0].parts.label.click()")
         await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
         assert await tab.text("learnt") == "1 press with a label that you entered"

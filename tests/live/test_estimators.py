@@ -9,8 +9,10 @@ import pytest
 import reskin
 from reskin.errors import ParamsError, SchemaError
 from reskin.live.emulator import Script, encode_pieces
-from reskin.live.session import PRESSES_N, GuidedPresses, Presses, Session
-from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
+from reskin.live.models import UniversalEstimator
+from reskin.live.presses import PRESSES_N, GuidedPresses, Presses
+from reskin.live.session import Session
+from reskin.live.tracker import UNKNOWN_SKIN, Estimates
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal.layout import paper_layout
@@ -109,10 +111,10 @@ def test_model_is_adapted_after_enough_presses_were_collected(random_pokes):
     change_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
     np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # The tolerance in uT allows for noise of 3 uT.
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(random_pokes[0])
+    estimator.set_noload(random_pokes[0].mean(axis=0))
     assert "adapted to 12 presses: median standard deviation of the places" in estimator.adapt(pokes.db_uT)
     before = estimator(pokes.db_uT.astype(np.float32))
-    estimator.set_noload(random_pokes[0])  # A new no-load reading keeps the adaptation.
+    estimator.set_noload(random_pokes[0].mean(axis=0))  # A new no-load reading keeps the adaptation.
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
@@ -149,12 +151,12 @@ def test_presses_within_the_noise_are_refused(random_pokes):
     noload_uT, b_uT, _, _ = random_pokes
     db_uT = b_uT - noload_uT.mean(axis=0)
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(noload_uT)
+    estimator.set_noload(noload_uT.mean(axis=0))
     before = estimator(db_uT.astype(np.float32)).target
     for calibrate in (estimator.adapt, lambda weak_uT: estimator.label(b_uT[:, :2], weak_uT, np.arange(len(b_uT)) < 3)):
         with pytest.raises(SchemaError, match="field changes must be 5 uT or more at one chip at least"):
             calibrate(1e-3 * db_uT)
-    estimator.set_noload(noload_uT)
+    estimator.set_noload(noload_uT.mean(axis=0))
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
 
 
@@ -162,7 +164,7 @@ def test_second_adaptation_replaces_the_presses_of_the_first_one(random_pokes):
     db_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
     corrected, adapted_once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for estimator in (corrected, adapted_once):
-        estimator.set_noload(random_pokes[0])
+        estimator.set_noload(random_pokes[0].mean(axis=0))
     corrected.adapt(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
     wrong = corrected(db_uT.astype(np.float32)).target
     for estimator in (corrected, adapted_once):
@@ -190,14 +192,14 @@ def test_presses_guided_by_the_page_calibrate_and_test_the_model(guided_pokes):
     assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(guided_pokes[0])
+    estimator.set_noload(guided_pokes[0].mean(axis=0))
     message = estimator.label(pokes.place_mm, pokes.db_uT, pokes.held_out)
     before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", message))
     found = estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2]
     held_out_mm = np.linalg.norm(found - guided_pokes[2][pokes.held_out], axis=1)
     assert after_mm == pytest.approx(np.median(held_out_mm), abs=0.006)
     assert after_mm < before_mm
-    estimator.set_noload(guided_pokes[0])  # A new no-load reading keeps the calibration.
+    estimator.set_noload(guided_pokes[0].mean(axis=0))  # A new no-load reading keeps the calibration.
     np.testing.assert_allclose(
         estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6
     )
@@ -211,7 +213,7 @@ def test_presses_guided_by_the_page_are_added_to_the_labels_of_a_calibration(gui
     model = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
     expected = model.label(place_mm[~kept], None, b_uT[~kept], keep=True).predict(b_uT)
     estimator = UniversalEstimator(calibrated)
-    estimator.set_noload(noload_uT)
+    estimator.set_noload(noload_uT.mean(axis=0))
     estimator.label(place_mm, b_uT - rest_uT, kept)
     np.testing.assert_allclose(estimator((b_uT - rest_uT).astype(np.float32)).target, expected, rtol=1e-3)
     assert calibrated.presses_n == kept.sum()

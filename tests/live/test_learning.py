@@ -12,14 +12,13 @@ import pytest
 from reskin import io
 from reskin.board import find
 from reskin.errors import CaptureError, ParamsError, SchemaError
-from reskin.live import used_model
+from reskin.live import models
 from reskin.live.emulator import encode_pieces
-from reskin.live.page_recording import LabelledPress, PageRecording
+from reskin.live.models import MEASURED_FILE, Labels, NetworkEstimator, SkinFolder, UniversalEstimator
+from reskin.live.presses import PRESSES_N, GuidedPresses, LabelledPress, PageRecording
 from reskin.live.server import receive
-from reskin.live.session import PRESSES_N, GuidedPresses, Session
-from reskin.live.skins import SkinFolder
-from reskin.live.tracker import Estimates, Labels, NetworkEstimator, UniversalEstimator
-from reskin.live.used_model import MEASURED_FILE, describe, read_measured
+from reskin.live.session import Session
+from reskin.live.tracker import Estimates
 from reskin.models.trained import read_network
 from reskin.recordings import probe
 from reskin.recordings.header import HEADER_FILE, PROBE_FILE, parse
@@ -157,7 +156,7 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     noload_uT, b_uT, place_mm, force_N = random_pokes
     db_uT = b_uT - noload_uT.mean(axis=0)
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(noload_uT)
+    estimator.set_noload(noload_uT.mean(axis=0))
     for i in range(3):
         unknown = i == 1
         text = estimator.add_label(tuple(place_mm[i].tolist()), math.nan if unknown else force_N[i], db_uT[i])
@@ -178,25 +177,90 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     assert len(estimator.learnt.labels.force_N) == 2
 
 
+def test_label_far_off_the_estimate_is_used_only_if_the_user_keeps_it(random_pokes):  # noqa: F811
+    script = make_poke_script(random_pokes)
+    slow = replace(script, t_s=5 * script.t_s)  # There are pauses of 1.25 s between the presses.
+    press_s = 5 * (QUIET_N + 200 * np.arange(4)) / 400
+    session, reader = running(slow, load_universal(), pauses_s=press_s - 0.9)
+    right = [{"x_mm": x, "y_mm": y, "force_N": None, "learn": True} for x, y in random_pokes[2].tolist()]
+
+    def labelled(label):
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        receive(session, json.dumps({"label": label}))
+        reader.resume()
+        until(lambda: session.state()["labelled"], session)
+        return session.state()
+
+    def wrong(label):
+        return label | {"y_mm": label["y_mm"] + (8.3 if label["y_mm"] < 8 else -8.3)}
+
+    try:
+        assert "calibrated to a labelled press" in labelled(right[0])["labelled"]
+        state = labelled(wrong(right[1]))
+        assert state["doubtful"]
+        assert state["labelled"] in state["alarms"]
+        assert len(session.skin.estimator.learnt.typed.force_N) == 1
+        receive(session, '{"press": "discard"}')
+        assert not session.state()["doubtful"]
+        assert not labelled(right[2])["doubtful"]
+        assert labelled(wrong(right[3]))["doubtful"]
+        assert "calibrated to a labelled press" in text_after(session, {"press": "keep"}, "labelled")
+        assert len(session.skin.estimator.learnt.typed.force_N) == 3
+    finally:
+        session.stop()
+
+
+def test_many_requests_for_changes_are_refused_and_estimates_continue(random_pokes, tmp_path):  # noqa: F811
+    load_universal().zero(random_pokes[0]).see(random_pokes[1]).save(tmp_path / "s1.safetensors")
+    script = make_poke_script(random_pokes)
+    session, reader = running(script, load_universal(), pauses_s=[QUIET_N / 400 - 0.05], skins=SkinFolder(tmp_path))
+    try:
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        for _ in range(500):
+            receive(session, '{"load": "s1"}')
+        assert "try again" in session.state()["adapted"]
+        reader.resume()
+        until(lambda: reader.at_end, session)
+        assert len(session.skin.estimator._states) < 50
+    finally:
+        session.stop()
+
+
+def test_full_disk_ends_a_recording_with_an_alarm(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session, reader = running(make_script(pokes_n=1), [], pauses_s=[QUIET_S - 0.2])
+    try:
+        until(reader.waiting.is_set, session)
+        receive(session, '{"press": "record"}')
+        reader.writer_problem = "cannot be written any more: No space left on device"
+        assert any("No space left" in alarm for alarm in session.state()["alarms"])
+        receive(session, '{"press": "record"}')
+        assert "No space left" in session.state()["recorded"]
+    finally:
+        session.stop()
+
+
 def test_refinement_needs_enough_labels_and_can_be_undone(random_pokes, monkeypatch):  # noqa: F811
     noload_uT, b_uT, place_mm, force_N = random_pokes
     db_uT = b_uT - noload_uT.mean(axis=0)
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(noload_uT)
+    estimator.set_noload(noload_uT.mean(axis=0))
     with pytest.raises(SchemaError, match="at least 20 labels with known forces; got 0"):
         estimator.refine()
-    assert not describe(estimator, load_universal(), "")["refinable"]
+    assert not estimator.describe("")["refinable"]
     typed = Labels(*(np.concatenate([part, part]) for part in (place_mm, force_N, db_uT)))
     estimator._learn(estimator.learnt._replace(typed=typed, step="labels"))
-    assert describe(estimator, load_universal(), "")["refinable"]
+    assert estimator.describe("")["refinable"]
     before = estimator(db_uT.astype(np.float32)).target
     weights = {name: value * np.float32(1.01) for name, value in estimator.model.weights.items()}
     monkeypatch.setattr("reskin.universal.making.refine", lambda *_: weights)
     assert estimator.refine().startswith("refined the network on 24 labelled presses")
     refined = estimator(db_uT.astype(np.float32)).target
     assert np.abs(refined - before).max() > 1e-3
-    assert describe(estimator, load_universal(), "")["learnt"].endswith("; network refined")
-    estimator.set_noload(noload_uT)  # A new no-load reading keeps the refinement.
+    assert estimator.describe("")["learnt"].endswith("; network refined")
+    estimator.set_noload(noload_uT.mean(axis=0))  # A new no-load reading keeps the refinement.
     np.testing.assert_allclose(estimator(db_uT.astype(np.float32)).target, refined, rtol=1e-6)
     assert estimator.undo() == "undone: refinement of the network"
     np.testing.assert_allclose(estimator(db_uT.astype(np.float32)).target, before, rtol=1e-6)
@@ -329,46 +393,45 @@ def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
 
 
 def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pokes):  # noqa: F811
-    measured = read_measured(MEASURED_FILE)
+    measured = io.read_json(MEASURED_FILE)
     noload_uT, b_uT, place_mm, force_N = random_pokes
     shipped = UniversalEstimator(load_universal())
-    texts = describe(shipped, load_universal(), "")
+    texts = shipped.describe("")
     assert texts["model"] == "universal model, shipped with reskin"
-    for each in measured.places[0].median_mm:  # There is one value for each recorded board.
+    for each in measured["places"][0]["median_mm"]:  # There is one value for each recorded board.
         assert f"{each:.1f}" in texts["expected"]
-    assert all(f"{each:.2g}" in texts["least_force"] for each in measured.detection.lightest_N)
+    assert all(f"{each:.2g}" in texts["least_force"] for each in measured["detection"]["lightest_N"])
     assert f"{shipped.model.layout.force_N[0]:.2g} N" in texts["least_force"]
     # For numbers of presses or labels that were not measured, the next smaller measured number is shown.
     many = load_universal().zero(noload_uT).see(np.tile(b_uT, (6, 1))[:65]).label(place_mm, force_N, b_uT)
-    texts = describe(UniversalEstimator(many), many, "s1.safetensors")
+    texts = UniversalEstimator(many).describe("s1.safetensors")
     assert texts["model"] == "universal model, file s1.safetensors"
     assert texts["learnt"] == "77 presses in the file"
     assert texts["expected"].endswith("after 65 presses and 10 labels)")
     refined = load_universal().zero(noload_uT).use_refined(many.weights)
-    assert describe(UniversalEstimator(refined), refined, "")["expected"] == "not measured for a refined network"
+    assert UniversalEstimator(refined).describe("")["expected"] == "not measured for a refined network"
     outside = load_universal(external_uT=30.0)
-    assert describe(UniversalEstimator(outside), outside, "")["expected"].endswith("not measured with external fields")
+    assert UniversalEstimator(outside).describe("")["expected"].endswith("not measured with external fields")
     other = replace(load_universal(), card={"name": "a model of another board"})
-    texts = describe(UniversalEstimator(other), other, "other.safetensors")
+    texts = UniversalEstimator(other).describe("other.safetensors")
     assert texts["expected"] == "not measured for this model"
     assert texts["least_force"].startswith("not measured; trained with simulated forces from ")
 
 
-def test_measured_accuracy_belongs_to_the_shipped_model(monkeypatch):
-    measured, shipped = read_measured(MEASURED_FILE), load_universal()
-    assert measured.model_sha256 == io.sha256(FILE)
-    others = measured.model_copy(update={"model_sha256": "0" * 64})
-    monkeypatch.setattr(used_model, "read_measured", lambda _: others)
-    monkeypatch.setattr(used_model, "_shipped", used_model._shipped.__wrapped__)  # without its cache
-    assert describe(UniversalEstimator(shipped), shipped, "")["expected"] == "not measured for this model"
+def test_measured_accuracy_belongs_to_the_shipped_model(monkeypatch, tmp_path):
+    measured, shipped = io.read_json(MEASURED_FILE), load_universal()
+    assert measured["model_sha256"] == io.sha256(FILE)
+    io.write_json(tmp_path / "measured.json", measured | {"model_sha256": "0" * 64})
+    monkeypatch.setattr(models, "MEASURED_FILE", tmp_path / "measured.json")
+    monkeypatch.setattr(models, "_shipped", models._shipped.__wrapped__)  # without its cache
+    assert UniversalEstimator(shipped).describe("")["expected"] == "not measured for this model"
 
 
 def test_page_describes_networks_by_the_scores_in_their_model_cards(tmp_path):
     network = read_network(write_model(tmp_path))
     scores = {"all": {"accuracy_pct": 71.4, "mse_xy_mm2": 0.512}}
     scored = replace(network, card=network.card | {"scores": scores, "test_boards": ["b0", "b1"]})
-    texts = describe(NetworkEstimator([scored]), [scored], "model.safetensors")
+    texts = NetworkEstimator([scored]).describe("model.safetensors")
     assert texts["model"] == "trained network, file model.safetensors"
     assert texts["expected"] == "71 % within 1 mm, MSE_xy 0.51 mm² (scene quick, tested on boards b0, b1)"
-    assert describe(NetworkEstimator([scored] * 2), [scored] * 2, "")["expected"] == "not measured for their mean"
-    assert describe(None, [], "")["model"] == ""
+    assert NetworkEstimator([scored] * 2).describe("")["expected"] == "not measured for their mean"

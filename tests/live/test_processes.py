@@ -26,6 +26,7 @@ from reskin.errors import ReskinError
 from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.preparing import CaptureNames, native
 from tests.live.boards import PLACES, make_script, write_model, write_script
+from tests.live.faults import inject
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 

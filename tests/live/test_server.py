@@ -19,9 +19,9 @@ from aiohttp import web
 from reskin.errors import CaptureError, ParamsError
 from reskin.live import server
 from reskin.live.emulator import playing
+from reskin.live.models import Models
 from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
 from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
-from reskin.live.tracker import Models
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, POKE_S, QUIET_S, RATE_HZ, make_script, plugged_in, write_model, zero_requests

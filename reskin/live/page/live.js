@@ -27,6 +27,7 @@ class Board {
     this.onSubmit("load_form", () => ({load: this.parts.saved.value}));
     this.onSubmit("undo_form", () => ({press: "undo"}));
     this.onSubmit("refine_form", () => ({press: "refine"}));
+    for (const name of ["keep", "discard"]) this.parts[name].addEventListener("click", () => this.send({press: name}));
     this.onSubmit("label_form", () => this.state.label_mm ? {label: null} : {label: {x_mm: this.parts.x.valueAsNumber, y_mm: this.parts.y.valueAsNumber,
       force_N: this.parts.force_N.value === "" ? null : this.parts.force_N.valueAsNumber, learn: this.parts.learn.checked}});
     this.connect();
@@ -99,6 +100,7 @@ class Board {
     this.say("folder", `Files are in the folder ${state.skins_folder}. A file is never replaced.`);
     this.parts.label.textContent = state.label_mm ? "Cancel the label" : "Label the next press";
     this.say("labelled", state.labelling || state.labelled || "");
+    this.parts.doubt.hidden = !state.doubtful;
     this.list("alarms", state.alarms);
     this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n} in ${s} s`));
     this.parts.zero.disabled = this.parts.record.disabled = state.waiting;

@@ -1,13 +1,13 @@
-"""Recordings that are started, labelled and stopped from the page of `reskin live`.
+"""Presses that the page of `reskin live` asks for: for a calibration, at shown places, or with a label of the user.
 
-`LabelledPress` finds the press that the user has labelled, and `PageRecording` writes the byte stream and the labels.
+`PageRecording` writes the byte stream and the labels of a recording that was started on the page.
 """
 
 import re
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from reskin import io
 from reskin.board.find import DetectedBoard
@@ -18,7 +18,14 @@ from reskin.recordings.header import HEADER_FILE, Clock, Source, render
 from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.recordings.stream_recorder import CaptureWriter
+from reskin.seeds import rng_for
+from reskin.universal.layout import BoardLayout, paper_layout
 
+PRESSES_N = 12  # number of presses anywhere for a calibration
+# The places for guided presses form a square grid. These are their coordinates along x and along y, relative to the
+# board's centre and as fractions of half the width of the sensing area.
+GUIDED = 0.375 * np.array([-1.5, -0.5, 0.5, 1.5])
+READINGS_MIN_N = 4  # a contact with fewer readings is not counted as a press
 # Each labelled press has a no-load dwell, which is a time without contact before the press. The following times are
 # assumed. The dwell begins RECOVERY_S or more after the previous contact, because the skin needs time to recover. It
 # ends APPROACH_S before the press, because the tip may touch the skin slowly. It lasts between REST_MIN_S and
@@ -30,6 +37,78 @@ PLATEAU = 0.8
 # Largest number of readings that are stored for one press, to limit the use of memory. At 400 Hz, these are the
 # readings of 50 s.
 PRESS_READINGS_MAX_N = 20_000
+
+
+class Presses:
+    """The presses that are collected for a calibration. For each press, the largest field change is stored."""
+
+    def __init__(self, presses_n: int = PRESSES_N) -> None:
+        self.presses_n = presses_n
+        self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
+        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change of the contact in progress
+        self._readings_n = 0
+
+    def __len__(self) -> int:
+        return len(self._strongest_uT)
+
+    @property
+    def complete(self) -> bool:
+        return len(self) >= self.presses_n
+
+    @property
+    def instruction(self) -> str:
+        """The text that tells the user which press is next, and where."""
+        return f"press {len(self) + 1} of {self.presses_n}, anywhere"
+
+    @property
+    def next_mm(self) -> list[float] | None:
+        """x and y in mm of the place that the user should press next; None if the user may press anywhere."""
+        return None
+
+    @property
+    def db_uT(self) -> Float64[np.ndarray, "n ch"]:
+        return np.array(self._strongest_uT)
+
+    def add(self, estimates: Estimates) -> None:
+        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a contact."""
+        known = np.isfinite(estimates.db_uT).all(axis=1)
+        for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
+            if contact:
+                self._readings_n += 1
+                if self._current_uT is None or np.linalg.norm(db_uT) > np.linalg.norm(self._current_uT):
+                    self._current_uT = db_uT
+                continue
+            if self._current_uT is not None and self._readings_n >= READINGS_MIN_N and not self.complete:
+                self._strongest_uT.append(self._current_uT)
+            self._current_uT, self._readings_n = None, 0
+
+
+class GuidedPresses(Presses):
+    """The presses that are collected at places of a grid. The page shows these places one by one in random order.
+
+    Every second press is held out: it is not used for the calibration, but to measure the error of the calibrated
+    model.
+    """
+
+    def __init__(self, board: BoardLayout | None = None) -> None:
+        board = board or paper_layout()
+        grid_mm = (
+            np.array(board.centre_mm) + np.stack(np.meshgrid(GUIDED, GUIDED), axis=-1).reshape(-1, 2) * board.half_mm
+        )
+        self.place_mm = rng_for(0, "shown places").permutation(grid_mm)
+        super().__init__(len(self.place_mm))
+
+    @property
+    def instruction(self) -> str:
+        return f"press {len(self) + 1} of {self.presses_n}, at the cross"
+
+    @property
+    def next_mm(self) -> list[float] | None:
+        return None if self.complete else self.place_mm[len(self)].tolist()
+
+    @property
+    def held_out(self) -> Bool[np.ndarray, " n"]:
+        return np.arange(self.presses_n) % 2 == 1
 
 
 class LabelledPress:
@@ -166,8 +245,10 @@ class PageRecording:
         OSError
             If the header cannot be written.
         """
+        problem = self._reader.writer_problem
         self._reader.write_to(None)
         if self._labels is not None:
             self._labels.close()
         end_capture(self.folder, self._header, self._writer.rate())
-        return f"recorded {self.folder}" + (f", labelled presses: {self.touches_n}" if self._labels else "")
+        text = f"recorded {self.folder}" + (f", labelled presses: {self.touches_n}" if self._labels else "")
+        return f"{text}; the recording ends early: it {problem}" if problem else text
