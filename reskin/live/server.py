@@ -12,12 +12,16 @@ import asyncio
 import errno
 import hmac
 import json
+import logging
 import re
 import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
-from socket import gaierror
+from socket import AF_INET, SOCK_DGRAM, gaierror, gethostname
+from socket import socket as Socket
+from typing import Any
 
 from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
@@ -27,10 +31,14 @@ from reskin.live.session import Session
 
 PAGE = Path(__file__).parent / "page"
 FILES = {"/": "index.html"} | {f"/{name}": name for name in ("live.js", "skin.js", "trace.js", "live.css")}
-LOCAL = ("127.0.0.1", "localhost", "::1")
+LOCAL, ANY = ("127.0.0.1", "localhost", "::1"), ("0.0.0.0", "::")
 LOCAL_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"
 FRAME_S, STATE_S, HEARTBEAT_S = 1 / 30, 0.2, 10.0
+# A connection is closed if its first request is not complete after `REQUEST_S`, or at once if there are too many
+# connections. Connections are checked once per `CHECK_S`.
+REQUEST_S, CHECK_S, CONNECTIONS_MAX_N, BACKLOG_N = 5.0, 0.5, 256, 16
+KEPT_ALIVE_S = 10.0  # an idle connection is closed after this time since its last request
 PAGES_MAX_N, REQUEST_BYTES_MAX_N = 8, 1024
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src data:; frame-ancestors 'none'",
@@ -49,10 +57,14 @@ class Server:
     def __init__(self, sessions: Sequence[Session], token: str) -> None:
         self._sessions, self._token = sessions, token
         self._sockets: list[set[web.WebSocketResponse]] = [set() for _ in sessions]  # open sockets of each board
+        self._asked: set[web.RequestHandler] = set()  # open connections that have sent a request
+        # time for which each of the other connections has been open
+        self._silent_s: dict[web.RequestHandler, float] = {}
 
     def application(self) -> web.Application:
         @web.middleware
         async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+            self._asked.add(request.protocol)
             self.check(request)
             return await handler(request)
 
@@ -62,6 +74,30 @@ class Server:
             app.router.add_get(path, self._file)
         app.on_shutdown.append(self._close)
         return app
+
+    async def run(self, host: str, http_port: int, say: Callable[[], None]) -> None:
+        """Serve the page until the process is interrupted. Call `say` as soon as the server listens."""
+        asyncio.get_running_loop().set_exception_handler(_log_unless_table_is_full)
+        runner = web.AppRunner(self.application(), handle_signals=True, keepalive_timeout=KEPT_ALIVE_S)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, host, http_port, backlog=BACKLOG_N).start()
+            say()
+            while runner.server is not None:
+                self._close_idle(runner.server.connections)
+                await asyncio.sleep(CHECK_S)
+        finally:
+            await runner.cleanup()
+
+    def _close_idle(self, connections: Sequence[web.RequestHandler]) -> None:
+        """Close connections that have sent no complete request for too long, and the oldest ones of too many."""
+        self._asked.intersection_update(connections)
+        silent = [connection for connection in connections if connection not in self._asked]
+        self._silent_s = {connection: self._silent_s.get(connection, 0.0) + CHECK_S for connection in silent}
+        too_many_n = len(connections) - CONNECTIONS_MAX_N
+        for i, (connection, silent_s) in enumerate(self._silent_s.items()):
+            if i < too_many_n or silent_s > REQUEST_S:
+                connection.force_close()
 
     def check(self, request: web.Request) -> None:
         """Raise `HTTPForbidden` if the token is wrong, or if the request's host or origin is not allowed."""
@@ -140,6 +176,34 @@ def receive(session: Session, text: str) -> None:
             session.request(message)
 
 
+def _log_unless_table_is_full(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Handle an error of the event loop. An error because too many files are open is logged once, in one line."""
+    error = context.get("exception")
+    if not isinstance(error, OSError) or error.errno not in (errno.EMFILE, errno.ENFILE):
+        loop.default_exception_handler(context)
+    else:
+        _log_once(f"too many open files: connections to the page must wait ({error.strerror})")
+
+
+@cache
+def _log_once(message: str) -> None:
+    logging.getLogger(__name__).warning(message)
+
+
+def address_of(host: str) -> str:
+    """Return the address at which a browser can open the page; for 0.0.0.0, that of this machine in its network."""
+    if host in LOCAL:
+        return "localhost"
+    if host not in ANY:
+        return f"[{host}]" if ":" in host else host
+    with Socket(AF_INET, SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing, but selects the network over which others are reached
+            return probe.getsockname()[0]
+        except OSError:  # there is no network
+            return gethostname()
+
+
 def serve(
     sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None], where: str = ""
 ) -> None:
@@ -156,12 +220,11 @@ def serve(
     for session in sessions:
         session.start()
     try:
-        address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
+        address = f"http://{address_of(host)}:{http_port}/{f'?token={token}' if token else ''}"
         announcement = f"{', '.join(map(str, sessions))}: open {address}; press Ctrl-C to stop"
         announcement += f"\n{where}" if where else ""
-        app = Server(sessions, token).application()
-        # aiohttp calls the function `print` once, as soon as the server listens.
-        web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)
+        with suppress(KeyboardInterrupt, web.GracefulExit):
+            asyncio.run(Server(sessions, token).run(host, http_port, lambda: say(announcement)))
     except OSError as error:
         if isinstance(error, gaierror) or error.errno in (None, errno.EADDRNOTAVAIL):
             remedy = "Try 127.0.0.1 (only this machine can connect) or 0.0.0.0 (other machines can connect too)."

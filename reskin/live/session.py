@@ -315,9 +315,10 @@ class Session:
             if self._labelled_press is not press:  # the user has cancelled the label
                 return
             self._labelled_press, self._doubtful_press = None, press if doubt else None
-            self._labelled = f"press {_place(press.label)}: {doubt}"
-        if not doubt:
-            self._use_label(press)
+            if doubt:
+                self._labelled = f"press {_place(press.label)}: {doubt}"
+                return
+        self._use_label(press)
 
     def _use_label(self, press: LabelledPress) -> None:
         """Write a label to the recording, and calibrate the model to the press."""

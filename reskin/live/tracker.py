@@ -463,10 +463,20 @@ class LiveSkin:
             if contact.any():
                 target[contact], sd_mm[contact], sd_F_N[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
+                failed = contact & ~np.isfinite(target).all(axis=1)
+                target[failed] = sd_mm[failed] = sd_F_N[failed] = np.nan
+                self.health.note("the estimate is not a finite number", int(failed.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
             expected_uT = self.estimator.model.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
             self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], expected_uT)
         return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, sd_F_N, contact)
+
+    def usable(self, estimates: Estimates) -> Bool[np.ndarray, " f"]:
+        """Return for each frame whether it is sound and, if there is a model, its estimate is finite."""
+        usable = np.isfinite(estimates.db_uT).all(axis=1)
+        if self.estimator is not None:
+            usable &= np.isfinite(estimates.target[:, 2])
+        return usable
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:
         if estimates is None:
@@ -477,7 +487,7 @@ class LiveSkin:
             )
         (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = estimates.target[i].tolist(), estimates.sd_mm[i].tolist()
         t_s, sd_mm, sd_F_N = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm), float(estimates.sd_F_N[i])
-        usable = bool(np.isfinite(estimates.db_uT[i]).all())
+        usable = bool(self.usable(estimates)[i])
         return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms(), sd_F_N, usable)
 
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-
 import reskin
 from reskin.api import AnyModel
 from reskin.board import find
@@ -208,7 +206,7 @@ class SkinSensor:
         try:
             while not self._stop.is_set():
                 estimates = skin.poll(WAIT_S, latest=True)
-                if estimates is None or not np.isfinite(estimates.db_uT[-1]).all():
+                if estimates is None or not skin.usable(estimates)[-1]:
                     continue
                 reading = self._values(estimates, estimated=skin.estimator is not None)
                 with self._changed:

@@ -179,9 +179,9 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
 
 def test_label_far_off_the_estimate_is_used_only_if_the_user_keeps_it(random_pokes):  # noqa: F811
     script = make_poke_script(random_pokes)
-    slow = replace(script, t_s=5 * script.t_s)  # There are pauses of 1.25 s between the presses.
-    press_s = 5 * (QUIET_N + 200 * np.arange(4)) / 400
-    session, reader = running(slow, load_universal(), pauses_s=press_s - 0.9)
+    slow = replace(script, t_s=10 * script.t_s)  # There are pauses of 2.5 s between the presses.
+    press_s = 10 * (QUIET_N + 200 * np.arange(4)) / 400
+    session, reader = running(slow, load_universal(), pauses_s=press_s - 1.9)
     right = [{"x_mm": x, "y_mm": y, "force_N": None, "learn": True} for x, y in random_pokes[2].tolist()]
 
     def labelled(label):

@@ -170,16 +170,49 @@ def test_address_that_cannot_be_used_raises_before_it_is_printed():
     assert printed == []
 
 
-def test_address_is_printed_as_soon_as_the_page_is_served(monkeypatch):
+def test_address_for_other_machines_is_printed_as_soon_as_the_page_is_served():
     printed: list[str] = []
 
-    def run_app(app, *, host, port, print, handle_signals) -> None:
-        assert printed == []
-        print("======== Running on ... ========")
+    def say(text: str) -> None:
+        printed.append(text)
+        with socketlib.create_connection(("127.0.0.1", number)):
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(web, "run_app", run_app)
-    server.serve([], host="0.0.0.0", http_port=8765, say=printed.append)
-    assert re.search(r"open http://0.0.0.0:8765/\?token=.+; press Ctrl-C", printed[0])
+    with socketlib.create_server(("127.0.0.1", 0)) as free:
+        number = free.getsockname()[1]
+    server.serve([], host="0.0.0.0", http_port=number, say=say)
+    # Another machine can open neither 0.0.0.0 nor localhost.
+    address, token = re.search(rf"open http://(\S+):{number}/\?token=(.+); press Ctrl-C", printed[0]).groups()
+    assert address not in ("0.0.0.0", "localhost")
+    assert token
+
+
+def test_connections_without_a_request_are_closed(monkeypatch):
+    monkeypatch.setattr(server, "CHECK_S", 0.05)
+    monkeypatch.setattr(server, "REQUEST_S", 0.2)
+    with socketlib.create_server(("127.0.0.1", 0)) as free:
+        address = free.getsockname()
+
+    async def act() -> None:
+        idle, half_sent = await asyncio.open_connection(*address), await asyncio.open_connection(*address)
+        half_sent[1].write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        async with aiohttp.ClientSession() as client, client.get(f"http://127.0.0.1:{address[1]}/") as page:
+            assert page.status == 200
+            assert await asyncio.wait_for(asyncio.gather(idle[0].read(), half_sent[0].read()), LONG_S) == [b"", b""]
+        monkeypatch.setattr(server, "REQUEST_S", LONG_S)
+        monkeypatch.setattr(server, "CONNECTIONS_MAX_N", 3)
+        crowd = [await asyncio.open_connection(*address) for _ in range(10)]
+        await asyncio.wait_for(asyncio.gather(*(reader.read() for reader, _ in crowd[:6])), LONG_S)
+        assert not crowd[-1][0].at_eof()
+
+    async def run() -> None:
+        listening = asyncio.Event()
+        serving = asyncio.create_task(Server([], "").run(*address, listening.set))
+        await listening.wait()
+        await act()
+        serving.cancel()
+
+    asyncio.run(run())
 
 
 def test_file_given_as_a_port_is_an_error(tmp_path):

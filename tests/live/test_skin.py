@@ -17,6 +17,7 @@ import reskin
 from reskin.board.port import open_port
 from reskin.errors import ReskinError
 from reskin.live.emulator import make_port, play
+from reskin.live.models import NetworkEstimator
 from reskin.live.tracker import TAKING_NOLOAD, LiveSkin
 from reskin.models.trained import read_network
 from reskin.seeds import rng_for
@@ -111,6 +112,21 @@ def test_frames_with_failed_reads_have_no_estimate(tmp_path):
     assert len(failed) == 200
     assert np.isnan(failed).all()
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
+
+
+def test_estimate_that_is_not_finite_is_never_usable(tmp_path):
+    class Overflowing(NetworkEstimator):
+        def __call__(self, db_uT):
+            return super().__call__(db_uT)._replace(target=np.tile([np.inf, 4.0, 1.0], (len(db_uT), 1)))
+
+    skin = LiveSkin("played")
+    skin.reader, skin.estimator = ScriptReader(SCRIPT), Overflowing([read_network(write_model(tmp_path))])
+    contacts = []
+    while not skin.reader.at_end:
+        if (estimates := skin.poll(0.0)) is not None:
+            contacts += [skin._contact(estimates, i) for i in range(len(estimates))]
+    assert not any(contact.usable and not contact.F_N == 0 for contact in contacts)
+    assert "the estimate is not a finite number" in skin.health.alarms
 
 
 def test_no_frame_is_lost_if_the_port_is_opened_within_a_frame():
