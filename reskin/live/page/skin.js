@@ -16,7 +16,7 @@ const contactRadius = (force_N) => 5 + 6 * Math.sqrt(Math.max(force_N || 0, 0));
 
 function frameOf(canvas, state) { // returns the size and the position of the skin on a canvas, with functions that convert between mm and pixels
   const [wide, high] = state.skin_mm || [20, 20], [x0, y0] = state.corner_mm || [-2, -2], {left, right, top, bottom} = AXES_PX;
-  const scale = Math.max(Math.min((canvas.clientWidth - left - right) / wide, (innerHeight * .8 - top - bottom) / high), .1); // the scale must not be 0, although the height of a hidden window is 0
+  const scale = Math.max(Math.min((canvas.clientWidth - left - right) / wide, (innerHeight * (boards.length > 1 ? .5 : .8) - top - bottom) / high), .1); // the scale must not be 0, although the height of a hidden window is 0
   return {wide, high, x0, y0, scale, at: (x, y) => [left + (x - x0) * scale, top + (y0 + high - y) * scale],
     mm: (px, py) => [x0 + (px - left) / scale, y0 + high - (py - top) / scale], height: high * scale + top + bottom};
 }
