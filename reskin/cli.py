@@ -301,15 +301,15 @@ def emulate(
 
     _announce_simulation(source)
     script = read_script(source, board=board, robot=robot is not None)
-    listeners: list[Callable[[int], None]] = []
+    listeners: list[Callable[[range], None]] = []
     if true_places:
         listeners.append(TouchPrinter(script, source, typer.echo))
     if robot is not None:
         listeners.append(RobotLog(script, robot, speed))
 
-    def on_sent(piece_i: int) -> None:
+    def on_sent(pieces: range) -> None:
         for listener in listeners:
-            listener(piece_i)
+            listener(pieces)
 
     emulated, stop = make_port(port), threading.Event()
     typer.echo(

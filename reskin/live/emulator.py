@@ -238,37 +238,7 @@ def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
     return [data[first : first + size] for first in range(0, len(data), size)]
 
 
-class EmulatedPort:
-    """Base class of emulated ports, which are pseudo-terminals or TCP servers.
-
-    The board sends bytes to the port, and another program, the reader, reads them from the port.
-    """
-
-    name: str
-
-    def __init__(self) -> None:
-        self._opened = False
-        self.plug_in()
-
-    def plug_in(self) -> None:
-        """Create the port."""
-        raise NotImplementedError
-
-    def unplug(self) -> None:
-        """Remove the port, to emulate an unplugged board or to clean up at the end."""
-        raise NotImplementedError
-
-    def send(self, data: bytes, stop: threading.Event) -> int:
-        """Send bytes as fast as the reader accepts them, until `stop` is set; return the number of bytes sent."""
-        raise NotImplementedError
-
-    def was_opened(self) -> bool:
-        """Return whether a reader has opened the port since the last call of this method."""
-        opened, self._opened = self._opened, False
-        return opened
-
-
-class Terminal(EmulatedPort):
+class Terminal:
     """A pseudo-terminal, which a reader opens like a serial port.
 
     When the board is plugged in again, the operating system may choose another name for the pseudo-terminal. A symbolic
@@ -282,9 +252,11 @@ class Terminal(EmulatedPort):
             raise ParamsError(f"--port: {link} is an existing file, not a link. Choose another name.")
         self._link = link
         self._open_ends: tuple[int, ...] = ()
-        super().__init__()
+        self.opened = False  # whether a reader has opened the port; `play` sets this to False again
+        self.plug_in()
 
     def plug_in(self) -> None:
+        """Create the pseudo-terminal and the link."""
         import fcntl
         import termios
         import tty  # these modules do not exist on Windows
@@ -308,6 +280,7 @@ class Terminal(EmulatedPort):
             self.name = str(self._link)
 
     def unplug(self) -> None:
+        """Remove the pseudo-terminal and the link."""
         if self._link is not None and self._open_ends:
             # Remove the link before the pseudo-terminal is closed. Once it is closed, another emulator may create a
             # link with the same name, which must not be removed.
@@ -317,24 +290,25 @@ class Terminal(EmulatedPort):
         self._open_ends = ()
 
     def send(self, data: bytes, stop: threading.Event) -> int:
+        """Send bytes as fast as the reader accepts them, until `stop` is set; return the number of bytes sent."""
         sent_n = 0
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
                 # The first byte is the packet status. The other bytes are data from the reader, which are ignored.
                 if readable:
-                    self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
+                    self.opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])
         return sent_n
 
 
-class TcpServer(EmulatedPort):
+class TcpServer:
     """A TCP server on this machine that serves one reader at a time, at `socket://127.0.0.1:PORT`."""
 
     def __init__(self, number: int = 0) -> None:
-        self._number = number
-        super().__init__()
+        self._number, self.opened = number, False
+        self.plug_in()
 
     def plug_in(self) -> None:
         try:
@@ -357,7 +331,7 @@ class TcpServer(EmulatedPort):
             try:
                 if self._client is None:
                     self._client = self._server.accept()[0]
-                    self._opened = True
+                    self.opened = True
                     self._client.settimeout(TICK_S)
                 sent_n += self._client.send(data[sent_n:])
             except TimeoutError:
@@ -367,6 +341,9 @@ class TcpServer(EmulatedPort):
                     self._client.close()
                 self._client = None
         return sent_n
+
+
+EmulatedPort = Terminal | TcpServer
 
 
 def make_port(kind: str) -> EmulatedPort:
@@ -396,7 +373,7 @@ def play(
     *,
     speed: float = 1.0,
     loop: bool = False,
-    on_sent: Callable[[int], None] = lambda piece_i: None,
+    on_sent: Callable[[range], None] = lambda pieces: None,
 ) -> int:
     """Send each piece of a script to a port at its due time.
 
@@ -406,7 +383,7 @@ def play(
     stop : event that another thread sets to end sending
     speed : factor by which all due times are divided. With `math.inf`, the script is sent as fast as the reader reads.
     loop : whether the script starts again at its end, and whenever a reader opens the port
-    on_sent : function that is called after each batch with the index of the last piece of the batch
+    on_sent : function that is called after each batch with the indices of the pieces in the batch
 
     Returns
     -------
@@ -425,9 +402,10 @@ def play(
             overdue_n = int(np.searchsorted(script.t_s, (now_s - blocked_s) * speed, "right")) - i
             first, i = i, i + min(max(overdue_n, 1), BATCH_MAX_N)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
-            on_sent(i - 1)
-            if port.was_opened() and loop:
+            on_sent(range(first, i))
+            if port.opened and loop:
                 i, start_s = 0, time.monotonic()
+            port.opened = False
         if not loop:
             break
         start_s += script.duration_s / speed
@@ -446,8 +424,8 @@ class EmulatedBoard:
     def has_true_contacts(self) -> bool:
         return self._true_contacts is not None
 
-    def note_sent(self, piece_i: int) -> None:
-        self._sent_i = piece_i
+    def note_sent(self, pieces: range) -> None:
+        self._sent_i = pieces[-1]
 
     def true_contact(self) -> tuple[float, float, float]:
         """Return the true x_mm, y_mm and F_N in the last frame that was sent.
@@ -474,75 +452,60 @@ class RobotLog:
             )
         self._cells = _robot_cells(script.true_contacts, script.presses_per_pass_n)
         self._due_s = script.t_s / speed
-        self._sent_i, self._last_s = -1, 0.0
+        self._last_s = 0.0
         self._stream = file.open("w", encoding="utf-8", buffering=1)  # each line is written immediately
         self._stream.write("unix_s,phase,pass_i,x_mm,y_mm,Fz_N\n")
 
-    def __call__(self, piece_i: int) -> None:
-        if piece_i < self._sent_i:  # the script has restarted
-            self._sent_i = -1
+    def __call__(self, pieces: range) -> None:
         now_s = time.time()
         # Several late frames may have been sent together. Their rows have the times at which they were due, relative to
         # the last of these frames.
-        for i in range(self._sent_i + 1, piece_i + 1):
-            self._last_s = max(self._last_s, now_s - float(self._due_s[piece_i] - self._due_s[i]))
+        for i in pieces:
+            self._last_s = max(self._last_s, now_s - float(self._due_s[pieces[-1]] - self._due_s[i]))
             self._stream.write(f"{self._last_s:.6f},{self._cells[i]}\n")
-        self._sent_i = piece_i
 
     def close(self) -> None:
         self._stream.close()
 
 
+def _touches(true_contacts: Float64[np.ndarray, "f 3"]) -> list[tuple[int, int]]:
+    """Return the first frame of each touch, and the frame after its end."""
+    edges = np.flatnonzero(np.diff(np.isfinite(true_contacts[:, 0]), prepend=False, append=False)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
 def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: int) -> list[str]:
     """Return the cells that follow the time in the row of each frame: phase, pass, place and force."""
-    contact = np.isfinite(true_contacts[:, 0])
-    # The first frame of a press, the frame after its end, the first frame of the next press, and so on.
-    edges = np.flatnonzero(np.diff(contact, prepend=False, append=False)).tolist()
-    cells = ["noload,0,,,"] * len(contact)
-    for press_i, (first, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+    presses, cells = _touches(true_contacts), ["noload,0,,,"] * len(true_contacts)
+    for press_i, (first, end) in enumerate(presses):
         force_max_N = true_contacts[first:end, 2].max()
         for i, (x_mm, y_mm, force_N) in enumerate(true_contacts[first:end].tolist(), first):
             phase = "contact" if force_N >= AT_REST * force_max_N else "moving"
             cells[i] = f"{phase},{press_i // presses_per_pass_n},{x_mm:g},{y_mm:g},{force_N:.4f}"
         # The rows without contact after a press belong to the pass of the next press. Otherwise, the no-load dwell
         # between two passes would be split into two.
-        following = edges[2 * press_i + 2] if 2 * press_i + 2 < len(edges) else len(contact)
+        following = presses[press_i + 1][0] if press_i + 1 < len(presses) else len(cells)
         pass_i = (press_i + 1) // presses_per_pass_n
         cells[end:following] = [f"noload,{pass_i},,,"] * (following - end)
     return cells
 
 
 class TouchPrinter:
-    """A function that prints the true place and the largest true force of each touch.
-
-    The text of a touch is printed when the first frame of the touch has been sent.
-
-    Raises
-    ------
-    ParamsError
-        If the true contacts of the script are unknown.
-    """
+    """A function that prints the true place and the largest true force of each touch when its first frame is sent."""
 
     def __init__(self, script: Script, source: str, say: Callable[[str], object]) -> None:
         if script.true_contacts is None:
             remedy = "Use source nominal, or the YAML file of a simulated scene with a protocol named log."
             raise ParamsError(f"--true-places: the true places of {source} are unknown. {remedy}")
-        contact = np.isfinite(script.true_contacts[:, 0])
-        # The first frame of a touch, the frame after its end, the first frame of the next touch, and so on.
-        edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
-        self._texts = {}
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        self._texts, self._say = {}, say
+        for first, end in _touches(script.true_contacts):
             x_mm, y_mm, force_N = script.true_contacts[first:end].max(axis=0)
             self._texts[first] = f"true place: x {x_mm:.1f} mm, y {y_mm:.1f} mm; largest force {force_N:.2f} N"
-        self._say, self._sent_i = say, -1
 
-    def __call__(self, piece_i: int) -> None:
-        if piece_i < self._sent_i:  # the script has restarted
-            self._sent_i = -1
-        for i in range(self._sent_i + 1, piece_i + 1):
+    def __call__(self, pieces: range) -> None:
+        for i in pieces:
             if i in self._texts:
                 self._say(self._texts[i])
-        self._sent_i = piece_i
 
 
 @contextmanager

@@ -129,7 +129,8 @@ class UniversalEstimator:
     The estimator calibrates a copy of the model. The model that was passed is not changed. The calibration uses the
     no-load reading, presses at unknown places (`adapt`) and presses at known places (`label` and `add_label`). If
     `adapt` or `label` is called again, the new presses replace those of the earlier call, so that the user can repeat
-    bad presses. `undo` reverts the last calibration step.
+    bad presses. `undo` reverts the last calibration step. Each step returns a text for the user. It raises SchemaError
+    if its data cannot be used, such as presses within the noise; the calibration is then unchanged.
     """
 
     name = "universal model"
@@ -162,17 +163,7 @@ class UniversalEstimator:
         self._use(self.learnt)
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to the field changes of presses at unknown places.
-
-        Returns
-        -------
-        A text for the user: the standard deviation of places, before and after the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If no press changes the field. The calibration is then unchanged.
-        """
+        """Calibrate to the field changes of presses at unknown places."""
         check_presses(db_uT)
         before = self._estimate(db_uT)
         step = f"calibration to {len(db_uT)} presses"
@@ -190,15 +181,6 @@ class UniversalEstimator:
         """Calibrate to presses at known places, except for presses that are held out to measure the error.
 
         The forces of the presses were not measured.
-
-        Returns
-        -------
-        A text for the user: the median error of the place at held-out presses, before and after the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If no press changes the field. The calibration is then unchanged.
         """
         check_presses(db_uT[~held_out])
 
@@ -215,20 +197,7 @@ class UniversalEstimator:
         )
 
     def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
-        """Calibrate to one more press, whose place and, if it was measured, force are known.
-
-        A force of NaN means that the force is unknown.
-
-        Returns
-        -------
-        A text for the user: the errors of the place and the force of this press before the calibration.
-
-        Raises
-        ------
-        SchemaError
-            If the field does not change, the place is not on the skin, or the force is out of the model's range. The
-            calibration is then unchanged.
-        """
+        """Calibrate to one more press, whose place and force are known; the force is NaN if it is unknown."""
         check_presses(db_uT[None])
         before = self._estimate(db_uT[None])
         one = Labels(np.array([place_mm], float), np.array([force_N]), db_uT[None].astype(np.float64))
@@ -241,9 +210,7 @@ class UniversalEstimator:
     def contradiction(self, place_mm: tuple[float, float], db_uT: Float[np.ndarray, " ch"]) -> str:
         """Compare the label of one more press with the estimate, which knows the earlier labels but not this one.
 
-        Returns
-        -------
-        A text for the user if they differ so much that the label is probably wrong; otherwise an empty text.
+        Return a text for the user if they differ so much that the label is probably wrong; otherwise an empty text.
         """
         estimate = self._estimate(db_uT[None])
         (x_mm, y_mm), sd_mm = estimate.place_mm[0], float(estimate.sd_mm.max())
@@ -257,27 +224,14 @@ class UniversalEstimator:
         )
 
     def refine(self) -> str:
-        """Train the network further on the labelled presses (see `Universal.refine`); return a text for the user.
-
-        Raises
-        ------
-        SchemaError
-            If there are too few labels with known forces. The calibration is then unchanged.
-        """
+        """Train the network further on the labelled presses (see `Universal.refine`)."""
         refined = copy(self._model).refine()
         data = refined.skin.data
         self._learn(self.learnt._replace(refined=data.refined, step="refinement of the network"))
         return f"refined the network on {len(data.labels)} labelled presses; button Undo reverts it"
 
     def load(self, file: Path) -> str:
-        """Replace all calibration data by a saved calibration; return a text for the user.
-
-        Raises
-        ------
-        SchemaError
-            If the file does not exist, is damaged, is not a saved calibration, or is for another kind of board. The
-            calibration is then unchanged.
-        """
+        """Replace all calibration data by a saved calibration."""
         if not file.is_file():  # for example, because another program deleted the file after the page had listed it
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
         origin = copy(self.learnt.origin).remember(file)
@@ -285,7 +239,7 @@ class UniversalEstimator:
         return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
 
     def undo(self) -> str:
-        """Revert the last calibration step; return a text for the user."""
+        """Revert the last calibration step."""
         if not self.undoable:
             return "nothing to undo: the model has not been calibrated on this page"
         step = self._states.pop().step
@@ -418,14 +372,7 @@ class SkinFolder:
         return sorted(file.stem for file in self.folder.glob(f"*{SUFFIX}") if re.fullmatch(NAME, file.stem))
 
     def file(self, name: object) -> Path:
-        """Return the file of the skin with this name.
-
-        Raises
-        ------
-        ParamsError
-            If the name is not allowed. A name has 1 to 64 letters, digits, - and _, and begins with a letter or a
-            digit.
-        """
+        """Return the file of the skin with this name; raise ParamsError if the name is not allowed."""
         if not isinstance(name, str) or not re.fullmatch(NAME, name):
             got = repr(name)[:40] if name else "nothing"
             raise ParamsError(
@@ -436,12 +383,8 @@ class SkinFolder:
     def save(self, name: object, model: Universal) -> str:
         """Save a calibrated model under a new name; return a text for the user.
 
-        Raises
-        ------
-        ParamsError
-            If the name is not allowed, or if there is already a saved skin with this name.
-        SchemaError
-            If the model has not been calibrated to any press, or if the file cannot be written.
+        Raises ParamsError or SchemaError if the name is not allowed or exists, the model has not been calibrated to any
+        press, or the file cannot be written.
         """
         file = self.file(name)
         if not model.presses_n:

@@ -54,6 +54,8 @@ class SimulatedClock:
 class FakeReader:
     """A reader that records when each frame arrives. After frame `late_i`, it pauses once, for `late_s`."""
 
+    opened = False
+
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
 
@@ -62,9 +64,6 @@ class FakeReader:
         if self.late_i in range(len(self.arrival_s)):
             self.times.s, self.late_i = self.times.s + self.late_s, -1
         return len(data)
-
-    def was_opened(self):
-        return False
 
 
 @pytest.fixture
@@ -266,8 +265,8 @@ def test_true_contact_belongs_to_the_last_frame_that_was_sent(times):
     board = EmulatedBoard(script, SimpleNamespace(name="port"))
     reader = FakeReader(times)
 
-    def note_sent(piece_i):
-        board.note_sent(piece_i)
+    def note_sent(pieces):
+        board.note_sent(pieces)
         found.append((len(reader.arrival_s), board.true_contact()))
 
     play(script, reader, times, on_sent=note_sent)
@@ -316,7 +315,7 @@ class TestRobot:
         log = RobotLog(robot_script, tmp_path / "robot.csv")
         for i in range(batch_n - 1, len(robot_script), batch_n):  # Frames that are late are sent in batches.
             clock.s = 1e9 + robot_script.t_s[i]
-            log(i)
+            log(range(i - batch_n + 1, i + 1))
         log.close()
         dwells = list(DwellBuilder().feed(SampleTable("log").feed((tmp_path / "robot.csv").read_bytes())))
         touches = [dwell for dwell in dwells if dwell.label.contact]
