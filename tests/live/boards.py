@@ -157,6 +157,9 @@ class FailingModel:
     def set_noload(self, b_uT: np.ndarray) -> None:
         """Accept any no-load reading."""
 
+    def describe(self, model_name: str) -> dict[str, str]:
+        return {"model": model_name}
+
     def __call__(self, db_uT: np.ndarray) -> None:
         raise RuntimeError("out of memory")
 
