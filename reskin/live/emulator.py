@@ -176,13 +176,9 @@ def simulate(
     If the settings contain the protocol `log`, this protocol is simulated. Otherwise, the main protocol is simulated,
     in which a grid of places is pressed.
 
-    Parameters
-    ----------
-    section : settings of the simulation, as in section `simulate` of a scene
-    seed : seed of all random generators
-    where : name of the source for error messages
-    board : name of the board; the first board of the settings by default
-    robot : whether the touches of protocol `log` are replaced by presses of a robot
+    `section` has the settings, as in section `simulate` of a scene, and `where` names it in error messages. By default,
+    the first board of the settings is used. With `robot`, the touches of protocol `log` are replaced by presses of a
+    robot.
     """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN

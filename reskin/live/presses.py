@@ -117,10 +117,7 @@ class LabelledPress:
     The object receives the estimates and finds the time in which the press is held, and the no-load dwell before the
     press.
 
-    Parameters
-    ----------
-    label : place and force of the press
-    learn : whether the model is calibrated to the press
+    If `learn` is set, the model is calibrated to the press.
     """
 
     def __init__(self, label: Label, *, learn: bool) -> None:
@@ -176,17 +173,8 @@ class LabelledPress:
 class PageRecording:
     """A recording that the user has started on the page of `reskin live`, with labels that are entered on the page.
 
-    Parameters
-    ----------
-    board : the port and the wire format of the board
-    reader : the object that reads the bytes from the port
-    port_in_name : whether the name of the folder contains the port
-    source : "simulated" if the board is emulated from a simulation
-
-    Raises
-    ------
-    ReskinError, OSError
-        If the folder of the recording cannot be created.
+    With several boards, the name of the folder must contain the port (`port_in_name`). Raises ReskinError or OSError if
+    the folder cannot be created.
     """
 
     def __init__(
@@ -213,12 +201,7 @@ class PageRecording:
     def add(self, press: LabelledPress) -> None:
         """Write the label of a press to the probe log, which is the file of the recording's labels.
 
-        Raises
-        ------
-        CaptureError
-            If the time without contact before the press is not in the recording.
-        OSError
-            If the log cannot be written.
+        Raises CaptureError if the time without contact before the press is not in the recording.
         """
         if press.rest_s is None or press.held_s is None or press.rest_s[0] < self._begun_s:
             raise CaptureError(
@@ -238,13 +221,7 @@ class PageRecording:
         io.write_text(self._part / HEADER_FILE, render(self._header))
 
     def end(self) -> str:
-        """Finish the recording; return a text for the user.
-
-        Raises
-        ------
-        OSError
-            If the header cannot be written.
-        """
+        """Finish the recording; return a text for the user. Raises OSError if the header cannot be written."""
         problem = self._reader.writer_problem
         self._reader.write_to(None)
         if self._labels is not None:

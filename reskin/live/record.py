@@ -45,17 +45,10 @@ class RecordingResult(NamedTuple):
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
 ) -> LabelSource | None:
-    """Create the source of labels that the options of `reskin record` request; return None if none is requested.
+    """Create the source of labels for the options of `reskin record`; return None if no labels are requested.
 
-    Parameters
-    ----------
-    labels : option `--labels`: either places that the user is asked to press, such as `grid:5x5:4`, or the name of a
-    CSV
-        file to which a robot appends labels
-    gauge : option `--gauge`: port of a force gauge, as `PORT` or `PORT@BAUD`
-    scan : option `--scan`: order of the prompts, "random" or "snake"; "random" by default
-    dwell_s : time for which a label from a prompt is valid
-    say : function that is called with the text of each prompt
+    `labels` is a text such as grid:5x5:4, or the name of a CSV file to which a robot appends labels. `gauge` is PORT or
+    PORT@BAUD. `say` is called with the text of each prompt.
     """
     port, _, baud = (gauge or "").partition("@")
     if baud and not baud.isdecimal():
@@ -93,10 +86,7 @@ def record_board(
 
     Parameters
     ----------
-    board : the port and its wire format
-    labels : source of the labels; None for a recording without labels
     folder : folder that is created for the capture; captures/DATE-TIME by default
-    seconds : maximum duration
     baud : baud rate, which USB ports ignore
     names : values for the capture's header: the keys `board` and `skin` have the names of the board and the skin, and
         the key `scan` has the order of the places

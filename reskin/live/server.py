@@ -209,12 +209,8 @@ def serve(
 ) -> None:
     """Serve the page of one or more boards until Ctrl-C.
 
-    Parameters
-    ----------
-    sessions : the boards
-    host, http_port : address and port on which the server listens
-    say : function that is called as soon as the server listens, with a text that contains the address of the page
-    where : text about the folders of saved files, which is added to this text
+    As soon as the server listens, `say` is called with a text that contains the address of the page and ends with
+    `where`, which names the folders of saved files.
     """
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:

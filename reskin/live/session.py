@@ -157,12 +157,8 @@ class Session:
 
     Parameters
     ----------
-    port : the board's port
-    models : the model that estimates contacts
     source : description of the board, which is displayed on the page
-    fault_policy : decides which faulty readings get no estimate
     alone : whether this is the only board on the page
-    skins : folder of saved calibrations
     model_name : name of the model's file; empty for the model that is shipped with the package
     emulated : the emulated board at the port; None for a real board, whose true contacts are unknown
     wire : format of the board, if it is none of those that are detected
@@ -479,13 +475,7 @@ class Session:
         """Use a label for the next press, or cancel the label for the next press if `label` is None.
 
         A label is a dict with the keys `x_mm` and `y_mm` (the place), `force_N` (the force, or None if it is unknown)
-        and `learn` (whether the model is calibrated to the press).
-
-        Raises
-        ------
-        ParamsError
-            If the label is invalid, if it would be neither recorded nor used for calibration, or if other presses are
-            being collected.
+        and `learn` (whether the model is calibrated to the press). Raises ParamsError if it cannot be used.
         """
         self._labelled_press, self._doubtful_press, self._labelled = None, None, ""
         if label is None:
@@ -542,13 +532,7 @@ def _place(label: Label) -> str:
 
 
 def _number(value: object, name: str, least: float, most: float, unit: str) -> float:
-    """Check a number that the page has sent, and return it as a float.
-
-    Raises
-    ------
-    ParamsError
-        If the value is not a number above `least` and below `most`.
-    """
+    """Return a number from the page as a float; raise ParamsError if it is not above `least` and below `most`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < most:  # False for NaN
         got = "nothing" if value is None else repr(value)[:40]
         raise ParamsError(f"label: {name} must be a number above {least:g} and below {most:g} {unit}; got {got}.")
@@ -566,11 +550,7 @@ def open_sessions(
     emulated: EmulatedBoard | None = None,
     wire: CustomWire | None = None,
 ) -> list[Session]:
-    """Create one session per port. See `Session` for the arguments.
-
-    All sessions use the same weights of the models and the same folder of saved skins, but each session has its own
-    calibration.
-    """
+    """Create one session per port (see `Session`); each has its own calibration, and all save skins in one folder."""
     check_ports(ports, models, "--port")
     skins, alone = skins or SkinFolder(), len(ports) == 1
     return [

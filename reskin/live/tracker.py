@@ -63,14 +63,7 @@ UNKNOWN_SKIN = "unknown skin: the model was not trained on such field changes"
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
-    """Check the names of ports, and whether the model can be used for the boards at these ports.
-
-    Raises
-    ------
-    ParamsError
-        If the name of a port is invalid or occurs twice, or if there are several ports but the model is calibrated to
-        one skin.
-    """
+    """Raise ParamsError if the name of a port is invalid or occurs twice, or if the model cannot be used for all."""
     find.check_named_once(ports, where)
     for port in ports:  # only the name is checked; the port need not exist yet, because a board may be plugged in later
         check_name(port)
@@ -279,14 +272,8 @@ class LiveSkin:
     def poll(self, wait_s: float, *, latest: bool = False) -> Estimates | None:
         """Decode all bytes that have arrived, and estimate the place and the force for each frame.
 
-        Parameters
-        ----------
-        wait_s : longest time to wait for data
-        latest : whether to return an estimate only for the last frame
-
-        Returns
-        -------
-        The estimates, or None if no complete frame has arrived.
+        Wait for data for `wait_s` at most. With `latest`, only the last frame gets an estimate. Return None if no
+        complete frame has arrived.
         """
         chunks = self.reader.take(wait_s)
         if not chunks:

@@ -308,6 +308,9 @@ def test_page_draws_several_boards(tmp_path):
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")
         await tab.look("several", "boards[1].last.contact")
+        # Place and force stand above the fold of a usual window, and not below the picture of the skin.
+        bottom = "boards.slice(0, 2).map(({parts}) => parts.force.getBoundingClientRect().bottom + scrollY)"
+        assert max(await tab.value(bottom)) < 450
 
     with ExitStack() as stack, ExitStack() as unplugged:
         names = plug_in_all(stack, unplugged, tmp_path, range(8))
