@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
 from reskin.errors import ParamsError, did_you_mean
 
@@ -27,19 +28,38 @@ class Strict(BaseModel):
 
 
 Model = TypeVar("Model", bound=Strict)
+YAML_BYTES_MAX = 2**22
+YAML_DEPTH_MAX = 50  # the files of this project have at most 10 levels
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a file as YAML 1.2, which is the version that DVC reads too. In YAML 1.1, `1e-3` would be text."""
+    """Read a file as YAML 1.2, which is the version that DVC reads too. In YAML 1.1, `1e-3` would be text.
+
+    Aliases are refused, because a few lines of them can expand to gigabytes, and so are large or deep files.
+    """
     try:
-        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > YAML_BYTES_MAX:
+            raise YAMLError(f"it has more than {YAML_BYTES_MAX} bytes")
+        text = path.read_text(encoding="utf-8")
+        _check_events(text)
+        return YAML(typ="safe").load(text)
     except FileNotFoundError:
         raise ParamsError(f"{path}: file not found. Check the path.") from None
-    except (YAMLError, UnicodeDecodeError) as error:
+    except (YAMLError, ValueError) as error:
         problem = " ".join(str(error).split())
         raise ParamsError(
             f"{path}: the file is not valid YAML: {problem}. Correct the line of the file that this message names."
         ) from None
+
+
+def _check_events(text: str) -> None:
+    """Raise if YAML text has aliases, or is nested so deeply that the loader would run out of stack."""
+    depth = 0
+    for event in YAML(typ="safe").parse(text):
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        if isinstance(event, AliasEvent) or depth > YAML_DEPTH_MAX:
+            fault = "an alias (*name)" if isinstance(event, AliasEvent) else f"more than {YAML_DEPTH_MAX} levels"
+            raise YAMLError(f"line {event.start_mark.line + 1} has {fault}")
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
