@@ -239,7 +239,7 @@ def test_adding_a_broken_recording_raises_and_leaves_no_files(root, tmp_path, co
 
 def test_missing_recording_is_an_error(root, tmp_path):
     missing = "none: file not found"
-    for layout in ("lab", "ini", "eflesh", "eflash7", "leaphand"):
+    for layout in ("lab", "ini", "eflesh", "leaphand"):
         assert_refused(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
     assert_refused(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
 
@@ -265,7 +265,7 @@ def test_error_for_a_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
 
 
 def test_recording_in_a_wrong_layout_is_an_error(root, lab_file):
-    for layout in ("ini", "eflesh", "eflash7", "leaphand"):
+    for layout in ("ini", "eflesh", "leaphand"):
         assert_refused(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
     assert_refused(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
 

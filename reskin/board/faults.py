@@ -149,7 +149,7 @@ def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
     """Mark the readings of a chip whose three field components are exactly 0.
 
     In the earth's field, a chip cannot read 0 on three axes at once, so such a reading comes from memory to which no
-    reading was written. Some rows of the public eFlashTeam7 recordings (layout `eflash7`) have zeros on all chips.
+    reading was written. Some rows of the public eFlashTeam7 recordings have zeros on all chips.
     """
     return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
 

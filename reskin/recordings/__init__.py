@@ -9,4 +9,4 @@ from typing import Literal
 
 # Layouts that have a reader in `readers`. They are listed here, because `reskin --help` shows them without importing
 # the readers.
-ReaderLayout = Literal["table", "lab", "ini", "eflesh", "eflash7", "leaphand"]
+ReaderLayout = Literal["table", "lab", "ini", "eflesh", "leaphand"]

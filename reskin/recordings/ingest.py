@@ -240,15 +240,12 @@ LOSSES = (
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# Keys with such a prefix and suffix that do not count as losses: frames between dwells, frames of an indentation
-# without a no-load reading or without a contact, and rows of zeros. In layout `eflash7`, the recorder writes a row of
-# zeros if it asks for a reading before the chips have measured again. The reader of this layout limits the number of
-# these rows.
+# Keys with such a prefix and suffix that do not count as losses: frames between dwells, and frames of an indentation
+# without a no-load reading or without a contact.
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
     "dropped_no_contact_frames_n",
-    "dropped_zero_rows_n",
 )
 
 # A function that returns the stream time of each frame. Its arguments are the frames, and the number of earlier frames.

@@ -1,14 +1,19 @@
-"""Read tables from text and CSV files, with errors that name the line and column.
+"""Read tables, with errors that name the line and column.
 
-`parse_csv` reads files that this project wrote, with known columns and types; `read_cells` and `to_numbers` read files
-that other recorders wrote.
+`parse_csv` reads files that this project wrote, with known columns and types; `TableFile` reads files that other
+recorders wrote.
 """
 
+import csv
 import gzip
+import io as bytes_io
+import json
 import re
+import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +21,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, Int, Shaped
 
-from reskin.errors import CaptureError
+from reskin.errors import CaptureError, did_you_mean
 from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
@@ -149,47 +155,291 @@ def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
 # Largest magnitude of a number in a file. All readings, places and unix times are below this limit, and float32 can
 # represent numbers up to it.
 MAGNITUDE_MAX = 1e10
+# Most bytes that a table may need in memory: more than 5 million readings of five chips, or 3.5 hours at 400 Hz. A
+# compressed file of a few kB could otherwise fill the memory.
+TABLE_BYTES_MAX = 2**30
+BLANKS = "blanks"  # delimiter of cells that any number of blanks and tabs separates
+OTHER_FILES = {  # first bytes of a file: what it is, and how it becomes a table
+    b"PK\x03\x04": ("a zip or Excel file", "Save the sheet as CSV"),
+    b"\x89HDF": ("an HDF5 file", "Write its arrays to a Parquet file: pandas.DataFrame(...).to_parquet(FILE)"),
+    b"\x89MCAP": ("an MCAP file", "Export its topics to CSV or Parquet"),
+    b"\x93NUMPY": ("a NumPy array", "Save named arrays: numpy.savez(FILE, name=array)"),
+    b"\x80\x04": ("a pickle", "Write the data frame to a Parquet file: data.to_parquet(FILE)"),
+    b"\x80\x05": ("a pickle", "Write the data frame to a Parquet file: data.to_parquet(FILE)"),
+    b"SQLite format": ("an SQLite database", "Export the table to CSV"),
+    b"MATLAB": ("a MATLAB file", "Export the table to CSV"),
+}
+EMPTY = pa.array(["", "nan", "none", "null"])  # cells without a value, in small letters
+UNREADABLE = (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError, EOFError, zipfile.BadZipFile)
 
 
-def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into cells; return one list of cells per line. Tabs may take the place of commas.
+class TableFile:
+    """A table in a text file (also compressed with gzip or in UTF-16), a Parquet file, JSON lines or an npz file.
 
-    Raises `CaptureError` if the lines do not have the same number of cells. If `separator` is None, cells are separated
-    by white space.
+    `names` has the names of the columns; without `has_names`, row 1 has values, and the names are numbers from 0. The
+    delimiter of a text file is found from row 1 unless it is given. The array of an npz file with two axes gives the
+    columns name0, name1, ... Raises CaptureError if the file cannot be read.
     """
-    text = _read_text(path, where)
-    if separator == "," and ";" in text.partition("\n")[0]:
-        raise CaptureError(f"{where}: {SEMICOLONS}")
-    first = text.partition("\n")[0]
-    if separator == "," and "\t" in first and "," not in first:
-        separator = "\t"
-    cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
-    for line_i, row in enumerate(cells):
-        if len(row) != len(cells[0]):
-            problem = f"line {line_i + 1} has {len(row)} columns, but line 1 has {len(cells[0])}"
-            raise CaptureError(f"{where}: {problem}. {COPY_AGAIN}")
-    return cells
+
+    def __init__(self, path: Path, where: str, *, delimiter: str | None = None, has_names: bool = True) -> None:
+        self._path, self._where = path, where
+        self.first_row = FIRST_ROW if has_names else 1
+        try:
+            with path.open("rb") as file:
+                start = file.read(16)
+        except OSError as error:
+            raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
+        with self._explaining():
+            self._open(start, delimiter, has_names)
+
+    def read(self, numbers: Iterable[str], others: Iterable[str] = (), *, decimal_comma: bool = False) -> pa.Table:
+        """Read columns as numbers (float64; NaN for an empty cell), and other columns as they are.
+
+        Raises CaptureError if one of the columns is missing or has a cell that is not a number. The file is read in
+        blocks, so that only these columns are in memory.
+        """
+        others = list(others)
+        names = list(dict.fromkeys([*numbers, *others]))
+        for name in names:
+            if self.names.count(name) > 1:
+                raise CaptureError(f"{self._where}: two columns have the name {name}. Remove one of these columns.")
+            if name not in self.names:
+                have, guess = ", ".join(self.names)[:200], did_you_mean(name, self.names)
+                raise CaptureError(f"{self._where}: no column {name!r}; the file has {have}.{guess} Correct the name.")
+        parts: dict[str, list[pa.Array]] = {name: [] for name in others}
+        made: dict[str, Any] = {name: np.empty(self._rows_n) for name in names if name not in others}
+        start = 0
+        with self._explaining():
+            for batch in self._blocks(names):
+                for name in names:
+                    if name in others:
+                        parts[name].append(batch.column(name))
+                    else:
+                        place, row = f"{self._where}: {name}", self.first_row + start
+                        made[name][start : start + len(batch)] = _numbers(batch.column(name), place, row, decimal_comma)
+                start += len(batch)
+        if start != self._rows_n:
+            raise CaptureError(
+                f"{self._where}: {self._rows_n} lines of values, but {start} rows: a quotation mark is not closed. "
+                "Remove it."
+            )
+        return pa.table(made | {name: pa.chunked_array(part) if part else [] for name, part in parts.items()})
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except CaptureError:
+            raise
+        except UNREADABLE as error:
+            problem = ascii(" ".join(str(error).split()))[1:-1][:120]
+            if match := COLUMNS_N.search(problem):
+                what = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}"
+                raise CaptureError(f"{self._where}: {what}. {COPY_AGAIN}") from None
+            problem = problem or "its values are nested too deeply"
+            raise CaptureError(
+                f"{self._where}: the file cannot be read as a table: {problem}. Check the file."
+            ) from None
+
+    def _open(self, start: bytes, delimiter: str | None, has_names: bool) -> None:
+        self._parquet: pq.ParquetFile | None = None
+        self._table: pa.Table | None = None
+        if start.startswith(b"PAR1"):
+            self._parquet = pq.ParquetFile(self._path)
+            self.names, self._rows_n = list(self._parquet.schema_arrow.names), self._parquet.metadata.num_rows
+        elif start.startswith(b"PK") and all(name.endswith(".npy") for name in _members(self._path, self._where)):
+            self._table = _arrays(self._path)
+        else:
+            for magic, (what, remedy) in OTHER_FILES.items():
+                if start.startswith(magic):
+                    raise CaptureError(f"{self._where}: the file is {what}. {remedy}.")
+            self._open_text(start, delimiter, has_names)
+        if self._table is not None:
+            self.names, self._rows_n = list(self._table.column_names), len(self._table)
+
+    def _open_text(self, start: bytes, delimiter: str | None, has_names: bool) -> None:
+        packed = start.startswith((GZIP_MARK, *UTF16_MARKS))
+        text = text_of(_expanded(self._path, self._where), self._where) if packed else None
+        with self._path.open("rb") if text is None else bytes_io.BytesIO(text.encode()) as file:
+            first = text_of(file.readline(), self._where).strip("\r\n")
+            last, self._rows_n = b"\n" if first else b"", 2 - self.first_row
+            while block := file.read(2**22):
+                last, self._rows_n = block[-12:], self._rows_n + block.count(b"\n")
+        _check_end(first, last, self._where)
+        if first.lstrip()[:1] == "{":
+            lines = (text or text_of(self._path.read_bytes(), self._where)).splitlines()
+            self._table = pa.Table.from_pylist([json.loads(line) for line in lines])
+            return
+        self._delimiter = delimiter or (max(";\t|,", key=first.count) if re.search(r"[;\t|,]", first) else BLANKS)
+        if self._delimiter == BLANKS:
+            text = text or text_of(self._path.read_bytes(), self._where)
+            text = "\n".join("\t".join(line.split()) for line in text.split("\n"))
+            first, self._delimiter = text.partition("\n")[0], "\t"
+        self._source = self._path if text is None else pa.py_buffer(text.encode())
+        cells = next(csv.reader([first], delimiter=self._delimiter))
+        self.names = [cell.strip() for cell in cells] if has_names else [str(i) for i in range(len(cells))]
+
+    def _blocks(self, names: list[str]) -> Iterator[pa.RecordBatch]:
+        if self._parquet is not None:
+            meta = self._parquet.metadata
+            groups = [meta.row_group(i) for i in range(meta.num_row_groups)]
+            columns = [group.column(i) for group in groups for i in range(meta.num_columns)]
+            cells_n = sum(column.num_values for column in columns if column.path_in_schema.split(".")[0] in names)
+            _check_size(8 * cells_n, self._where)
+            texts = [name for name in names if pa.types.is_string(self._parquet.schema_arrow.field(name).type)]
+            # A text that all rows share is read once, because a small file may have a long text in millions of rows.
+            return pq.ParquetFile(self._path, read_dictionary=texts).iter_batches(columns=names)
+        if self._table is not None:
+            return iter(self._table.select(names).to_batches())
+        unique = [f"{i} {name}" if self.names.count(name) > 1 else name for i, name in enumerate(self.names)]
+        try:
+            return pacsv.open_csv(
+                self._source,
+                read_options=pacsv.ReadOptions(
+                    use_threads=False, skip_rows=self.first_row - 1, column_names=unique, block_size=2**22
+                ),
+                parse_options=pacsv.ParseOptions(delimiter=self._delimiter, ignore_empty_lines=False),
+                convert_options=pacsv.ConvertOptions(
+                    column_types=dict.fromkeys(names, pa.string()), include_columns=names
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            if "Empty CSV" in str(error):  # a file without a row below the names
+                return iter(())
+            raise
 
 
-def to_numbers(
-    cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int = 1
-) -> Float64[np.ndarray, "f c"]:
-    """Parse cells as finite numbers.
+def count_columns(path: Path, where: str, delimiter: str | None) -> int:
+    return len(TableFile(path, where, delimiter=delimiter, has_names=False).names)
 
-    Errors name the column and the line of a wrong cell; `first_line_n` is the number of the line with `cells[0]`.
+
+def read_rows(path: Path, where: str, names: Sequence[str], delimiter: str | None) -> Float64[np.ndarray, "f c"]:
+    """Read all columns of a text file without a row of names as finite numbers.
+
+    `names` are the names of the columns in errors.
     """
-    if cells and len(cells[0]) != len(names):
-        problem = f"the file has {len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
+    file = TableFile(path, where, delimiter=delimiter, has_names=False)
+    if len(file.names) != len(names):
+        problem = f"the file has {len(file.names)} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
         raise CaptureError(f"{where}: {problem}. Check the layout and the number of chips.")
-    if not cells:
-        raise CaptureError(f"{where}: the file has no row of numbers. Copy the recording again.")
-    try:
-        numbers = np.array(cells, dtype=np.float64)
-    except ValueError:
-        raise _first_fault(cells, where, names, first_line_n) from None
-    if not (np.abs(numbers) < MAGNITUDE_MAX).all():
-        raise _first_fault(cells, where, names, first_line_n)
+    table = file.read(file.names)
+    numbers = np.stack([np.asarray(column) for column in table.columns], axis=1)
+    refuse_empty(dict(zip(names, numbers.T, strict=True)), np.ones(len(numbers), bool), where, 1)
     return numbers
+
+
+def refuse_empty(
+    columns: Mapping[str, Float64[np.ndarray, " f"]], rows: Bool[np.ndarray, " f"], where: str, first_row: int
+) -> None:
+    """Raise if one of the given rows lacks a number."""
+    for name, values in columns.items():
+        if (lacking := np.isnan(values) & rows).any():
+            place = f"{name} in line {first_row + int(lacking.argmax())}"
+            raise CaptureError(where, place, "a finite number", "an empty cell or nan", "Correct or remove this row.")
+
+
+def coded(column: pa.ChunkedArray) -> tuple[list[Any], Int[np.ndarray, " f"]]:
+    """Return the different values of a column, and the index of each row's value among them."""
+    column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode(null_encoding="encode")
+    whole = column.unify_dictionaries().combine_chunks()
+    values = whole.dictionary.to_pylist()
+    return [*values, None], np.asarray(whole.indices.fill_null(len(values)))
+
+
+def _numbers(column: pa.Array, place: str, row: int, decimal_comma: bool) -> Float64[np.ndarray, " f"]:
+    """Convert a part of a column, whose first cell is in the given row, to numbers."""
+    column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+    cells = column
+    if is_text := pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+        cells = pc.utf8_trim_whitespace(column)
+        cells = pc.replace_substring(cells, ",", ".") if decimal_comma else cells
+        cells = pc.if_else(pc.is_in(pc.utf8_lower(cells), EMPTY), None, cells)
+    try:
+        numbers = np.asarray(pc.cast(cells, pa.float64()).to_numpy(zero_copy_only=False))
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+        if not is_text:
+            raise CaptureError(f"{place}: values of type {column.type} are no numbers. Correct the column.") from None
+        numbers = np.full(len(cells), np.inf)
+    if not (wrong := np.abs(numbers) >= MAGNITUDE_MAX).any():
+        return numbers
+    texts = cells.to_pylist()
+    i = next(i for i, bad in enumerate(wrong) if bad and texts[i] is not None and not is_number(str(texts[i])))
+    got = str(column[i].as_py())[:20]
+    remedy = (
+        "State `decimal_comma: true` in a map of columns, or correct this row." if "," in got else "Correct this row."
+    )
+    raise CaptureError(f"{place} in line {row + i} must be a number below {MAGNITUDE_MAX:g}; got {got!r}. {remedy}")
+
+
+def is_number(cell: str) -> bool:
+    return re.fullmatch(NUMBER_PATTERN, cell, re.ASCII) is not None and abs(float(cell)) < MAGNITUDE_MAX
+
+
+def _check_end(first: str, last: bytes, where: str) -> None:
+    """Raise if a text file is empty, or does not end with a line break."""
+    if not first and not last:
+        raise CaptureError(f"{where}: the file is empty. Copy the recording again.")
+    if not last.endswith(b"\n"):
+        raise CaptureError(
+            f"{where}: the last line has no line break; it ends in {last.decode(errors='replace')!a}. If the file "
+            "was cut, copy the recording again. If the last line is complete, add a line break after it."
+        )
+
+
+def _check_size(bytes_n: int, where: str) -> None:
+    if bytes_n > TABLE_BYTES_MAX:
+        raise CaptureError(
+            f"{where}: the table needs {bytes_n / 2**30:.1f} GiB or more in memory, but at most "
+            f"{TABLE_BYTES_MAX / 2**30:g} GiB are allowed. Split it into several files."
+        )
+
+
+def _expanded(path: Path, where: str) -> bytes:
+    """Read a file, and decompress it if it is a gzip file that is not too large."""
+    content = path.read_bytes()
+    if not content.startswith(GZIP_MARK):
+        return content
+    try:
+        with gzip.open(path) as file:
+            content = file.read(TABLE_BYTES_MAX + 1)
+    except (OSError, EOFError, zlib.error):
+        raise CaptureError(f"{where}: the gzip file is damaged. Copy the file again.") from None
+    _check_size(len(content), where)
+    return content
+
+
+def _members(path: Path, where: str) -> list[str]:
+    """Return the names of the files in a zip file, which must not be too large."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_size(sum(info.file_size for info in archive.infolist()), where)
+            return archive.namelist() or [""]
+    except zipfile.BadZipFile:
+        return [""]
+
+
+def _arrays(path: Path) -> pa.Table:
+    """Return the arrays of an npz file as columns."""
+    columns: dict[str, np.ndarray] = {}
+    with np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            array = np.atleast_1d(arrays[name])
+            flat = array.reshape(len(array), -1)
+            numbered = {f"{name}{i}": flat[:, i] for i in range(flat.shape[1])}
+            columns |= {name: array} if array.ndim == 1 else numbered
+    return pa.table(columns)
+
+
+def text_of(content: bytes, where: str) -> str:
+    """Decode the bytes of a text file; its byte order mark, if any, tells UTF-16 from UTF-8."""
+    try:
+        return content.decode("utf-16" if content[:2] in UTF16_MARKS else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        byte = f"{content[error.start]:#04x} at position {error.start}"
+        raise CaptureError(
+            f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file. If it "
+            "has a table in another container, docs/add-a-skin.md (option --columns) says which can be read."
+        ) from None
 
 
 def make_readings(
@@ -222,58 +472,16 @@ def _dtype(name: str) -> type[np.generic]:
     return np.int32 if UNITS[name] == "1" else np.float32
 
 
-def _read_text(path: Path, where: str) -> str:
-    try:
-        text = text_of(path.read_bytes(), where)
-    except OSError as error:
-        raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
-    if not text.endswith("\n"):
-        if not text:
-            raise CaptureError(f"{where}: the file is empty. Copy the recording again.")
-        raise CaptureError(
-            f"{where}: the last line has no line break; it ends in {text[-12:]!r}. If the file was cut, copy the "
-            "recording again. If the last line is complete, add a line break after it."
-        )
-    return text
-
-
-def text_of(content: bytes, where: str) -> str:
-    """Decode a text file, which may be compressed (gzip); its byte order mark, if any, tells UTF-16 from UTF-8."""
-    try:
-        content = gzip.decompress(content) if content[:2] == GZIP_MARK else content
-    except (OSError, EOFError, zlib.error):
-        raise CaptureError(f"{where}: the gzip file is damaged. Copy the file again.") from None
-    try:
-        return content.decode("utf-16" if content[:2] in UTF16_MARKS else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        byte = f"{content[error.start]:#04x} at position {error.start}"
-        raise CaptureError(
-            f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file. If it "
-            "has a table in another container, docs/add-a-skin.md (option --columns) says which can be read."
-        ) from None
-
-
-def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> CaptureError:
-    """Return the error for the first cell that is not a number, or that is too large."""
-    for row_i, row in enumerate(cells):
-        for name, cell in zip(names, row, strict=True):
-            if not is_number(cell):
-                place = f"{name} in line {first_line_n + row_i}"
-                rule = f"a finite number below {MAGNITUDE_MAX:g}"
-                return CaptureError(
-                    where, place, rule, repr(cell[:20]), "Correct or remove this row, then add the recording again."
-                )
-    raise AssertionError("the numbers were refused, although every cell is a number")
-
-
-def is_number(cell: str) -> bool:
-    try:
-        return abs(float(cell)) < MAGNITUDE_MAX
-    except ValueError:
-        return False
-
-
 PHASES = ("noload", "contact")
+
+
+def only_file(recording: Path, layout: str) -> Path:
+    """Return the file of a recording; raise if it is a folder or does not exist."""
+    if not recording.is_file():
+        raise CaptureError(
+            f"{recording}: not a file. A recording of layout {layout} is one file: add each file separately."
+        )
+    return recording
 
 
 def count_chips_of(names: list[str]) -> int:
@@ -315,20 +523,26 @@ def _renaming(names: list[str], wanted: list[str]) -> str:
     return ""
 
 
-def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
+def contact_rows(phases: pa.ChunkedArray, where: str) -> Bool[np.ndarray, " f"]:
     """Mark the rows of phase `contact`.
 
     Raises `CaptureError` if a phase is neither `noload` nor `contact`, or if no row has phase `contact`.
     """
-    for row_i, phase in enumerate(phases):
-        if phase not in PHASES:
-            place = f"phase in line {first_line_n + row_i}"
-            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct the text of this cell.")
-    if "contact" not in phases:
+    values, code = coded(phases)
+    names = [str(value).strip() for value in values]
+    known = np.isin(names, PHASES)[code]
+    if not known.all():
+        row_i = int(np.argmin(known))
+        got = repr(names[code[row_i]][:20])
+        raise CaptureError(
+            where, f"phase in line {FIRST_ROW + row_i}", "noload or contact", got, "Correct the text of this cell."
+        )
+    contact = (np.array(names) == "contact")[code]
+    if not contact.any():
         raise CaptureError(
             f"{where}: no row has phase contact. If the recording was cut, copy the whole recording again."
         )
-    return np.array([phase == "contact" for phase in phases])
+    return contact
 
 
 def count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:

@@ -3,12 +3,14 @@
 The checks raise `CaptureError` if the values are not plausible in these units, and suggest a conversion.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from reskin.board import chips, faults
 from reskin.errors import CaptureError
-from reskin.recordings.probe import ProbeLog
+from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.tables import FIRST_ROW
 
 # Largest field that an MLX90393 can send: 2^15 steps of its coarsest LSB, which is 9.680 uT along z with GAIN_SEL 0 and
@@ -141,23 +143,32 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
         raise CaptureError(where, "the greatest depth", rule, f"{deepest_mm:.4g}", remedy)
 
 
-def check_log(log: ProbeLog, where: str) -> None:
-    """Raise if places, depths or forces of a probe log are probably not in mm and N.
+def check_labels(
+    labels: Mapping[str, Float[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str, *, first_line_n: int
+) -> None:
+    """Raise if places, depths or forces, by the name of their column, are probably not in mm and N.
 
-    Also raises if the force Fz is negative in compression.
+    Columns may be missing, and values may be unknown (NaN). Also raises if the force Fz is negative in compression.
     """
-    contact = log.contact
-    force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
-    for axis_N in force_N.T:
-        check_forces(axis_N, where, first_line_n=FIRST_ROW)
-    check_touch(force_N[contact], where)
-    place_mm = np.where(contact[:, None], np.stack([log.x_mm, log.y_mm], axis=1), np.nan)
-    check_places(place_mm, where, first_line_n=FIRST_ROW)
-    check_depths(log.depth_mm[contact], where)
-    known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
-    if len(known_N) and np.median(known_N) < 0:
-        got = f"{np.median(known_N):.4g} N"
-        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, "Reverse the sign of Fz_N.")
+    for axis in ("Fx_N", "Fy_N", "Fz_N"):
+        if axis in labels:
+            check_forces(labels[axis], where, first_line_n=first_line_n)
+    forces = [labels[axis][contact] for axis in ("Fx_N", "Fy_N", "Fz_N") if axis in labels]
+    check_touch(np.array(forces), where)
+    place_mm = np.stack([labels["x_mm"], labels["y_mm"]], axis=1)
+    check_places(np.where(contact[:, None], place_mm, np.nan), where, first_line_n=first_line_n)
+    if "depth_mm" in labels:
+        check_depths(labels["depth_mm"][contact], where)
+    pressed_N = labels["Fz_N"][contact & np.isfinite(labels["Fz_N"])] if "Fz_N" in labels else np.zeros(0)
+    if len(pressed_N) and np.median(pressed_N) < 0:
+        got = f"{np.median(pressed_N):.4g} N"
+        remedy = "Reverse the sign of Fz_N in the file or in the map of columns."
+        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, remedy)
+
+
+def check_log(log: ProbeLog, where: str) -> None:
+    """Check the labels of a probe log; see `check_labels`."""
+    check_labels({name: getattr(log, name) for name in LABELS}, log.contact, where, first_line_n=FIRST_ROW)
 
 
 def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:

@@ -1,6 +1,7 @@
 """Tests of maps of columns: tables of other recorders become tables of layout `table`."""
 
 import gzip
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -8,8 +9,13 @@ import pytest
 
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings.column_map import convert, read_map
+from reskin.recordings.fault_policy import STANDARD_POLICY
+from reskin.recordings.header import write_capture
+from reskin.recordings.preparing import CaptureNames, mapped
+from reskin.recordings.readers import READERS
 from reskin.seeds import rng_for
 
+ROOT = Path(__file__).resolve().parents[2]
 FIELDS = [f"B{axis}{chip}" for chip in range(2) for axis in "xyz"]
 RIGHT = pd.DataFrame(
     {
@@ -106,14 +112,14 @@ def test_times_may_be_dates(tmp_path):
         (("x_mm: x_mm", "x_mm: X"), "no column 'X'; the file has phase, x_mm"),
         (("Fz_N: Fz_N", "Fz_N: {of: Fz_N, unit: pound}"), "Fz_N: unit pound is not one of N, mN, kN, g, kg"),
         (("Fz_N: Fz_N", "Fn_N: Fz_N"), "Fn_N is not one of x_mm, y_mm"),
-        (("phase: phase", "phase: {of: phase}"), "state either `contact` or `above`"),
+        (("phase: phase", "phase: {of: phase}"), "state one of `contact`, `above`"),
         (
             ("phase: phase", "phase: {of: phase, contact: [touch]}"),
             "by column phase, which has noload, contact",
         ),
         (("t_s: t_s", "t_s: {of: time, unit: iso}"), "no column 'time'"),
         (('{Bx: "B{}x", By: "B{}y", Bz: "B{}z"}', "{of: b}"), "no column 'b'"),
-        (("t_s: t_s", "t_s: phase"), "phase in line 2 must be a number; got 'noload'"),
+        (("t_s: t_s", "t_s: phase"), "phase in line 2 must be a number .*got 'noload'"),
     ],
 )
 def test_mistakes_in_a_map_are_named(tmp_path, change, message):
@@ -130,3 +136,24 @@ def test_other_containers_are_named_with_a_remedy(tmp_path, start, what):
     (tmp_path / "a.csv").write_bytes(start + bytes(100))
     with pytest.raises(CaptureError, match=f"the file is {what}.*\\. (Write|Save|Export)"):
         converted(tmp_path, tmp_path / "a.csv", SAME)
+
+
+def test_map_in_the_examples_reads_the_recordings_of_eflash7(tmp_path, shared_data):
+    columns = read_map(ROOT / "examples/eflash7_columns.yaml")
+    for file in sorted((shared_data / "eflash7").glob("position_*.csv")):
+        header, files = mapped(file, CaptureNames("flash", "pad", None), ROOT / "examples/eflash7_columns.yaml")
+        folder = tmp_path / header.capture
+        readings, counts = READERS["table"].read(folder, write_capture(folder, header, files), STANDARD_POLICY)
+        raw = pd.read_csv(file)
+        assert convert(file, columns).num_rows == counts["rows_read_n"] == len(raw)
+        assert counts["dropped_failed_read_rows_n"] == (raw.filter(like="mag") == 0).all(axis=1).sum()
+        np.testing.assert_allclose(readings.Fz_N.max(), -raw.fz.min(), rtol=0.02)
+
+
+def test_a_column_may_tell_contact_and_be_a_number_too(tmp_path):
+    data = renamed().assign(phase=[0, 0, 0, 1, 1, 1])
+    data.to_csv(tmp_path / "a.csv", index=False)
+    text = SAME.replace("phase: phase", "phase: {of: phase, contact: 1}").replace("t_s: t_s", "pass: phase")
+    assert list(converted(tmp_path, tmp_path / "a.csv", text)["pass"]) == [0, 0, 0, 1, 1, 1]
+    below = SAME.replace("phase: phase", "phase: {of: x_mm, below: 1.5}")
+    assert list(converted(tmp_path, tmp_path / "a.csv", below).phase) == ["contact"] * 3 + ["noload"] * 3

@@ -17,7 +17,7 @@ from reskin.errors import CaptureError
 from reskin.logs import quiet_start
 from reskin.recordings.fault_policy import STANDARD_POLICY, FaultLog
 from reskin.recordings.readers import sd_card
-from reskin.recordings.tables import check_columns, read_cells
+from reskin.recordings.tables import TableFile, check_columns
 from reskin.recordings.units import check_fields
 from reskin.seeds import rng_for
 
@@ -201,12 +201,17 @@ def test_renamings_are_proposed(names, remedy):
 
 @pytest.mark.parametrize(
     "change",
-    [lambda text: text.replace(b",", b"\t"), gzip.compress, lambda text: text.decode().encode("utf-16")],
-    ids=["tab", "gz", "utf-16"],
+    [
+        lambda text: text.replace(b",", b"\t"),
+        lambda text: text.replace(b",", b"; "),
+        lambda text: text.replace(b",", b"  "),
+        gzip.compress,
+        lambda text: text.decode().encode("utf-16"),
+    ],
+    ids=["tab", "semicolon", "blanks", "gz", "utf-16"],
 )
 def test_table_may_have_tabs_or_be_compressed(tmp_path, change):
     file = tmp_path / "readings.csv"
-    file.write_bytes(b"a,b\n1,2\n")
-    expected = read_cells(file, "here", separator=",")
-    file.write_bytes(change(b"a,b\n1,2\n"))
-    assert read_cells(file, "here", separator=",") == expected
+    file.write_bytes(change(b"a,b\n1,2\n3,4\n"))
+    found = TableFile(file, "here").read(["b"], ["a"])
+    assert found.to_pydict() == {"b": [2.0, 4.0], "a": ["1", "3"]}

@@ -165,9 +165,8 @@ def test_load_recording_raises_an_error_that_names_the_unreadable_file(tmp_path)
 
 
 def test_load_recording_tells_which_layout_a_recording_needs(shared_data):
-    for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
-        with pytest.raises(ReskinError, match=f"This is layout {layout}. Convert it to a capture with `reskin add`"):
-            reskin.load_recording(shared_data / name)
+    with pytest.raises(ReskinError, match="This is layout lab. Convert it to a capture with `reskin add`"):
+        reskin.load_recording(shared_data / "lab/board1_depth1.csv")
 
 
 def test_error_names_the_extra_to_install_if_pandas_is_missing(tmp_path, monkeypatch):

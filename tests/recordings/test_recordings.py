@@ -12,8 +12,8 @@ import pytest
 
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
-from reskin.recordings.readers import eflash7, eflesh, ini, lab
-from reskin.recordings.tables import read_cells
+from reskin.recordings.readers import eflesh, ini, lab
+from reskin.recordings.tables import TableFile
 from reskin.schema import Readings
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
@@ -78,10 +78,9 @@ def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name
 def test_noise_of_lab_recordings_equals_that_of_the_data_sheet(shared_data: Path, name: str) -> None:
     # The noise is the deviation from the mean of each press. With 65 x 9 degrees of freedom per channel, its standard
     # error is 3 %.
-    trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
-    names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
-    columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
-    b_uT = np.array([[float(row[i]) for i in columns] for row in rows]).reshape(65, 10, 15)
+    columns = [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
+    table = TableFile(shared_data / "lab" / f"{name}.csv", name).read(columns, ["phase"]).to_pandas()
+    b_uT = table.loc[table.phase == "noload", columns].to_numpy().reshape(65, 10, 15)
     sd_uT = np.sqrt(b_uT.var(axis=1, ddof=1).mean(axis=0)).reshape(5, 3)
     # In all recordings, the noise is 3.0 to 3.3 uT (x, y) and 4.4 to 5.0 uT (z). Single channels deviate by the
     # standard error of 3 %.
@@ -181,32 +180,3 @@ def test_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: Path)
     assert len(readings) == 7200
     assert np.isnan(readings.Fz_N).all()
     assert 17 < np.nanmax(readings.Fx_N) < 18.5
-
-
-@pytest.mark.parametrize(
-    ("name", "places", "zero_rows_n", "force_max_N"),
-    [("position_1_20251028_003401", {1}, 18, 3.5), ("multi_touch_2_7_20251109_234435", {2, 7}, 41, 12.7)],
-)
-def test_eflash7_places_are_numbered_and_rows_of_zeros_are_dropped(
-    shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, force_max_N: float
-) -> None:
-    readings, account = ingest(eflash7, shared_data / "eflash7" / f"{name}.csv", tmp_path)
-    assert {n for n in range(1, 10) if f"place_{n}_rows_n" in account} == places
-    assert account["dropped_zero_rows_n"] == zero_rows_n
-    assert np.isnan(readings.x_mm).all()
-    np.testing.assert_allclose(readings.Fz_N.max(), force_max_N, atol=0.1)
-
-
-def test_later_eflash7_recordings_start_with_another_no_load_field(shared_data: Path, tmp_path: Path) -> None:
-    files = sorted((shared_data / "eflash7").glob("*.csv"))
-    assert len(files) == 19
-    rest_uT, read_n = [], 0
-    for file in files:
-        readings, account = ingest(eflash7, file, tmp_path)
-        assert 6 <= account["noload_rows_n"] <= 72
-        assert 0.03 < account["dropped_zero_rows_n"] / account["rows_read_n"] < 0.11
-        rest_uT.append(np.linalg.norm(readings.noload_uT[0]))
-        read_n += account["rows_read_n"]
-    assert read_n == 7351
-    # The largest change is in the ninth recording of single touches, 12 minutes after the first one.
-    assert 270 < max(rest_uT) < 280

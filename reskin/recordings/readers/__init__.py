@@ -9,7 +9,7 @@ from typing import Protocol
 
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
-from reskin.recordings.readers import eflash7, eflesh, ini, lab, leaphand, table
+from reskin.recordings.readers import eflesh, ini, lab, leaphand, table
 from reskin.schema import Readings
 
 
@@ -33,5 +33,5 @@ class Reader(Protocol):
 
 
 READERS: Mapping[str, Reader] = {
-    "table": table, "lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7, "leaphand": leaphand,
+    "table": table, "lab": lab, "ini": ini, "eflesh": eflesh, "leaphand": leaphand,
 }  # fmt: skip

@@ -17,16 +17,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
-from reskin.recordings.tables import make_readings, read_cells, to_numbers
-from reskin.recordings.units import (
-    DEPTH_MIN_mm,
-    SAME_PLACE_mm,
-    check_depths,
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
-)
+from reskin.recordings.tables import count_columns, make_readings, read_rows
+from reskin.recordings.units import DEPTH_MIN_mm, SAME_PLACE_mm, check_fields, check_labels
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 SENSOR = "sensor.csv"
@@ -36,8 +28,7 @@ FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
 NEWTON_PER_GRAM = 9.80665e-3  # weight of one gram in standard gravity
-# Index of the column of the weight in states.csv, after time, x, y and z. There is no such column if the force was not
-# recorded.
+STATES_COLUMNS = ("time", "x", "y", "z", "weight")  # the last is missing if the force was not recorded
 WEIGHT_COLUMN = 4
 NO_NEW_WEIGHT = -1.0  # the recorder writes this number if the gauge has not measured since the previous row
 # The recorder writes a row to each of two files in one step of its loop, so the times in these rows differ by
@@ -71,7 +62,7 @@ def collect(recording: Path) -> dict[str, Path]:
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the columns of `sensor.csv`: the time, then three columns per chip."""
     where = str(files[SENSOR])
-    columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
+    columns_n = count_columns(files[SENSOR], where, None)
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
         raise CaptureError(
             f"{where}: {columns_n} columns cannot be a time and three columns per chip. Check that the layout is "
@@ -86,24 +77,19 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     The no-load field is the baseline that the recorder subtracted. It is computed as the raw field minus the field
     change, which are in two files.
     """
-    time_s, b_uT, noload_uT = _read_fields(folder, header)
-    states = _read_states(folder, header)
-    _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
-    _check_clocks(time_s, states[:, 0], header)
+    sensor, change_uT, states = _read_files(folder, header)
+    time_s, b_uT = sensor[:, 0], sensor[:, 1:]
+    noload_uT = b_uT - change_uT
     temperature_degC = np.full((len(time_s), header.chips_n), np.nan, np.float32)
     rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=f"{header.capture}/{SENSOR}", policy=policy)
-    place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
-    place_mm -= place_mm.min(axis=0)
-    pass_i, touches_i = _number_passes(place_mm, noload_uT)
+    labels = _read_labels(states, header)
+    pass_i, touches_i = _number_passes(np.stack([labels["x_mm"], labels["y_mm"]], axis=1), noload_uT)
     readings = make_readings(
         header,
         rows.keep,
         indentation=np.arange(len(time_s)),
         pass_i=pass_i,
-        x_mm=place_mm[:, 0],
-        y_mm=place_mm[:, 1],
-        **_read_force(states, header),
-        depth_mm=_read_depth(states, header),
+        **labels,
         b_uT=b_uT,
         noload_uT=noload_uT,
         temperature_degC=temperature_degC,
@@ -122,65 +108,39 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     }
 
 
-def _read_fields(
+def _read_files(
     folder: Path, header: Header
-) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
-    """Read times, raw fields and no-load fields; raise if the two files of the sensor have different times."""
-    names = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
-    sensor, changes = (
-        to_numbers(read_cells(folder / name, where, separator=","), where, names=names)
-        for name, where in ((name, f"{header.capture}/{name}") for name in (SENSOR, CHANGES))
+) -> tuple[Float64[np.ndarray, "f c"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f s"]]:
+    """Read the raw fields with their times, the field changes, and the states; check that they belong together."""
+    fields = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
+    states_n = count_columns(folder / STATES, f"{header.capture}/{STATES}", None)
+    names = {SENSOR: fields, CHANGES: fields, STATES: list(STATES_COLUMNS[: max(states_n, WEIGHT_COLUMN)])}
+    sensor, changes, states = (
+        read_rows(folder / name, f"{header.capture}/{name}", of, None) for name, of in names.items()
     )
-    _check_rows_n({SENSOR: len(sensor), CHANGES: len(changes)}, header)
-    differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
-    if len(differ):
-        where = f"{header.capture}/{CHANGES} line {differ[0] + 1}"
-        raise CaptureError(
-            f"{where}: the time differs from the time in the same line of {SENSOR}. Use both files of the same "
-            "recording."
-        )
-    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
-    return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
-
-
-def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
-    """Read the columns time, x, y, z and, if the force was recorded, the weight."""
-    where = f"{header.capture}/{STATES}"
-    cells = read_cells(folder / STATES, where, separator=",")
-    names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
-    states = to_numbers(cells, where, names=names)
-    check_places(states[:, 1:3], where)
-    if not _holds_height(states[:, 3]):
-        check_depths(states[:, 3] - states[:, 3].min(), where)
-    return states
-
-
-def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
-    if len(set(rows_n.values())) != 1:
-        got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
+    if not len(sensor) == len(changes) == len(states):
+        got = f"{len(sensor)} in {SENSOR}, {len(changes)} in {CHANGES} and {len(states)} in {STATES}"
         raise CaptureError(
             f"{header.capture}: the files have different numbers of rows, {got}. If one of the files was cut, copy all "
             "files again."
         )
-
-
-def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Raise if the times in the two files differ too much in any row, or if the times do not increase."""
-    disagreeing = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
-    if len(disagreeing):
-        where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
-        difference_s = states_s[disagreeing[0]] - sensor_s[disagreeing[0]]
-        raise CaptureError(
-            f"{where}: the time differs by {difference_s:.3f} s from the time in {SENSOR}; less than "
-            f"{CLOCKS_APART_MAX_s} s is allowed. A row may be missing in one of the files: copy all files again."
-        )
-    back = np.flatnonzero(np.diff(sensor_s) <= 0)
+    for name, times_s, most_s in ((CHANGES, changes[:, 0], 0.0), (STATES, states[:, 0], CLOCKS_APART_MAX_s)):
+        apart_s = np.abs(times_s - sensor[:, 0])
+        if apart_s.max() > most_s:
+            line_n = 1 + int((apart_s > most_s).argmax())
+            raise CaptureError(
+                f"{header.capture}/{name} line {line_n}: the time differs by {apart_s[line_n - 1]:.3f} s from the time "
+                f"in {SENSOR}; at most {most_s:g} s are allowed. A row may be missing in one of the files: copy all "
+                "files again."
+            )
+    back = np.flatnonzero(np.diff(sensor[:, 0]) <= 0)
     if len(back):
-        where = f"{header.capture}/{SENSOR}"
         raise CaptureError(
-            f"{where}: time does not increase in line {back[0] + 2}. If the file contains two recordings, split it "
-            "into two files."
+            f"{header.capture}/{SENSOR}: time does not increase in line {back[0] + 2}. If the file contains two "
+            "recordings, split it into two files."
         )
+    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
+    return sensor, changes[:, 1:], states
 
 
 def _number_passes(
@@ -200,32 +160,28 @@ def _number_passes(
     return pass_i, pass_i
 
 
-def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return a mapping from the name of the force's column to the force; {} if there was no gauge.
+def _read_labels(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
+    """Return the places, the depths, and the force along the axis of the gauge if there was one, by their columns.
 
+    The depths are below the highest z. They are NaN if z was constant, or if the gauge measured a force along x or y.
     The force is NaN in rows without a new value of the gauge.
     """
-    if states.shape[1] <= WEIGHT_COLUMN:
-        return {}
-    if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
-        got = header.options if header.options else "no option"
-        remedy = "State the axis along which the gauge measured the force, with --force-axis."
-        raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
-    weight_g, where = states[:, WEIGHT_COLUMN], f"{header.capture}/{STATES}"
-    weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
-    check_forces(weight_N, where, first_line_n=1)
-    check_touch(weight_N, where)
-    return {f"F{header.options['force_axis']}_N": weight_N}
-
-
-def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Return the depths below the highest z.
-
-    The depths are NaN if z was constant, or if the gauge measured a force along x or y.
-    """
-    along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
     z_mm = states[:, 3]
-    return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm
+    place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
+    place_mm -= place_mm.min(axis=0)
+    unknown = np.full(len(z_mm), np.nan)
+    depth_mm = unknown if _holds_height(z_mm) else z_mm.max() - z_mm
+    labels = {"x_mm": place_mm[:, 0], "y_mm": place_mm[:, 1], "depth_mm": depth_mm}
+    axis = "z"
+    if states.shape[1] > WEIGHT_COLUMN:
+        axis = header.options.get("force_axis", "none")
+        if axis not in FORCE_AXES:
+            remedy = "State the axis along which the gauge measured the force, with --force-axis."
+            raise CaptureError(header.capture, "option force_axis", "x, y or z", axis, remedy)
+        weight_g = states[:, WEIGHT_COLUMN]
+        labels[f"F{axis}_N"] = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
+    check_labels(labels, np.ones(len(z_mm), bool), f"{header.capture}/{STATES}", first_line_n=1)
+    return labels if axis == "z" else labels | {"depth_mm": unknown}
 
 
 def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:

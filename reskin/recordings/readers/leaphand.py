@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float64, Int64
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
-from reskin.recordings.tables import make_readings, read_cells, to_numbers
+from reskin.recordings.tables import BLANKS, count_columns, make_readings, only_file, read_rows
 from reskin.recordings.units import check_changes
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
@@ -77,17 +77,13 @@ class _Pad:
 
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the text file itself."""
-    if not recording.is_file():
-        raise CaptureError(
-            f"{recording}: not a file. A recording of layout leaphand is one text file: add each file separately."
-        )
-    return {READINGS: recording}
+    return {READINGS: only_file(recording, "leaphand")}
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
     """Check the number of columns, and return the number of chips of one pad, because a capture has one pad."""
     where = str(files[READINGS])
-    _count_pads(read_cells(files[READINGS], where, separator=None), where)
+    _count_pads(files[READINGS], where)
     return CHIPS_N
 
 
@@ -127,8 +123,7 @@ def read_motion(folder: Path, header: Header, policy: FaultPolicy) -> Motion:
 def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     """Read the file of a capture, select the pad, and find the faulty rows and the no-load rows."""
     where = f"{header.capture}/{READINGS}"
-    cells = read_cells(folder / READINGS, where, separator=None)
-    pads_n = _count_pads(cells, where)
+    pads_n = _count_pads(folder / READINGS, where)
     if header.chips_n != CHIPS_N:
         raise CaptureError(
             f"{where}: the header says {header.chips_n} chips, but a pad has {CHIPS_N}. Correct the header."
@@ -136,7 +131,7 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     first = CHANNELS_N * (_pad_number(header, pads_n) - 1)
     fields = [f"B{axis}{chip} of pad {pad + 1}" for pad in range(pads_n) for chip in range(CHIPS_N) for axis in "xyz"]
     joints = [f"joint {joint + 1}" for joint in range(JOINTS_N * pads_n)]
-    numbers = to_numbers(cells, where, names=[*fields, *joints])
+    numbers = read_rows(folder / READINGS, where, [*fields, *joints], BLANKS)
     b_uT, joint_counts = numbers[:, first : first + CHANNELS_N], numbers[:, len(fields) :]
     check_changes(b_uT, where, first_line_n=1)
     wrong = (joint_counts != np.rint(joint_counts)) | (joint_counts < 0) | (joint_counts >= COUNTS_PER_TURN)
@@ -160,9 +155,9 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     return pad
 
 
-def _count_pads(cells: list[list[str]], where: str) -> int:
+def _count_pads(file: Path, where: str) -> int:
     """Return the number of pads, from the number of columns."""
-    columns_n, per_pad_n = len(cells[0]), CHANNELS_N + JOINTS_N
+    columns_n, per_pad_n = count_columns(file, where, BLANKS), CHANNELS_N + JOINTS_N
     if columns_n % per_pad_n or not 1 <= columns_n // per_pad_n <= PADS_MAX_N:
         rule = f"{CHANNELS_N} fields and {JOINTS_N} joint positions for each of 1 to {PADS_MAX_N} pads"
         raise CaptureError(where, "the number of columns", rule, columns_n, "Check that the layout is leaphand.")

@@ -1,44 +1,36 @@
 """Read layout `table`: a recording of any rig in one CSV or Parquet file with named columns."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, Int
 
 from reskin.errors import CaptureError
-from reskin.recordings.fault_policy import FaultPolicy, check_rows
+from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_passes
 from reskin.recordings.tables import (
+    FIRST_ROW,
+    TableFile,
     check_columns,
     contact_rows,
     count_chips_of,
     count_within,
     make_readings,
     mean_by_group,
-    read_cells,
-    to_numbers,
+    only_file,
+    refuse_empty,
 )
-from reskin.recordings.units import (
-    SAME_PLACE_mm,
-    WEAKEST_uT,
-    check_depths,
-    check_fields,
-    check_forces,
-    check_places,
-    check_touch,
-)
+from reskin.recordings.units import SAME_PLACE_mm, WEAKEST_uT, check_fields, check_labels
 from reskin.schema import Readings
 
 CSV, PARQUET = "readings.csv", "readings.parquet"
 FILES = (CSV,)
 NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
-FIRST_LINE_N = 2  # line number of the first row of numbers in a CSV file
-EMPTY = ("", "nan", "NaN")
 # If the name of an unknown column begins with one of these words, it is probably the misspelt name of a known column.
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
@@ -55,17 +47,32 @@ def columns_of(chips_n: int) -> list[str]:
     return [*NEEDED, *fields, *OPTIONAL, *(f"T{chip}" for chip in range(chips_n))]
 
 
+@dataclass(frozen=True)
+class Rows:
+    """All rows of a table, and the result of the check for faults.
+
+    `numbers` has the columns that are not fields, by name. `press` is the number of the press to which each row
+    belongs, in the order of the file; a row without contact belongs to the next press.
+    """
+
+    numbers: Mapping[str, Float64[np.ndarray, " f"]]
+    contact: Bool[np.ndarray, " f"]
+    b_uT: Float64[np.ndarray, "f ch"]
+    temperature_degC: Float64[np.ndarray, "f k"]
+    press: Int[np.ndarray, " f"]
+    checked: CheckedRows
+    where: str
+
+
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV or Parquet file itself."""
-    if not recording.is_file():
-        raise CaptureError(f"{recording}: not a file. A table is one CSV or Parquet file: add each file separately.")
-    return {PARQUET if recording.suffix == ".parquet" else CSV: recording}
+    return {PARQUET if recording.suffix == ".parquet" else CSV: only_file(recording, "table")}
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the names of the columns."""
     (file,) = files.values()
-    return count_chips_of(_read_cells(file, str(file))[0])
+    return count_chips_of(TableFile(file, str(file)).names)
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
@@ -75,70 +82,82 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     """
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
-    names, cells = _read_cells(folder / name, where)
-    if (chips_n := count_chips_of(names)) != header.chips_n:
+    file = TableFile(folder / name, where)
+    columns = columns_of(count_chips_of(file.names))
+    check_columns(file.names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
+    _refuse_near_names(file.names, columns, where)
+    known = [column for column in columns[1:] if column in file.names]
+    readings, account = to_readings(check_table(file.read(known, ["phase"]), header, policy, where), header)
+    return readings, account | {"ignored_columns_n": len(set(file.names) - set(columns))}
+
+
+def check_table(table: pa.Table, header: Header, policy: FaultPolicy, where: str) -> Rows:
+    """Check the columns of a table: the number of chips, faults of the board, units, and signs."""
+    if (chips_n := count_chips_of(table.column_names)) != header.chips_n:
         raise CaptureError(
             f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file, or "
             "correct chips_n in header.json."
         )
-    columns = columns_of(header.chips_n)
-    check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
-    contact = contact_rows([row[names.index("phase")].strip() for row in cells], where, FIRST_LINE_N)
-    _refuse_near_names(names, columns, where)
-    known = [column for column in columns[1:] if column in names and not _is_empty(column, names, cells)]
-    numbers = dict(zip(known, _to_numbers(names, cells, known, contact, where).T, strict=True))
-    b_uT = np.stack([numbers[column] for column in columns[len(NEEDED) : len(NEEDED) + 3 * header.chips_n]], axis=1)
+    contact = contact_rows(table["phase"], where)
+    fields = [f"B{axis}{chip}" for chip in range(chips_n) for axis in "xyz"]
+    numbers = {name: np.asarray(table[name]) for name in table.column_names if name not in ("phase", *fields)}
+    for name in fields:
+        refuse_empty({name: np.asarray(table[name])}, np.ones(len(contact), bool), where, FIRST_ROW)
+    # An optional column without any value is like no column, as in a template that was filled in partly.
+    numbers = {name: of for name, of in numbers.items() if name in NEEDED or not np.isnan(of).all()}
+    refuse_empty(numbers, contact, where, FIRST_ROW)
+    b_uT = np.empty((len(contact), len(fields)))
+    for i, name in enumerate(fields):
+        b_uT[:, i] = table[name]
+    del table  # 1 million rows have 120 MB of fields
     unknown = np.full(len(contact), np.nan)
-    temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
-    rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
-    _check(numbers, b_uT, contact, rows.keep, where)
+    temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(chips_n)], axis=1)
+    checked = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
+    sound_uT = b_uT if checked.keep.all() else b_uT[checked.keep]
+    _refuse_subtracted(sound_uT, contact[checked.keep], where)
+    check_fields(sound_uT, where, line_n=FIRST_ROW + np.flatnonzero(checked.keep))
+    check_labels(numbers, contact, where, first_line_n=FIRST_ROW)
     press = _number_presses(numbers, contact, where)
-    # Number the blocks of rows. A block is a run of no-load rows together with the contact rows after it.
-    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)
-    rest = ~contact & rows.keep
-    noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
-    keep = contact & rows.keep
-    without = np.flatnonzero(keep & np.isnan(noload_uT[:, 0]))
+    return Rows(numbers, contact, b_uT, temperature_degC, press, checked, where)
+
+
+def to_readings(rows: Rows, header: Header) -> tuple[Readings, Account]:
+    """Return the readings of the rows in contact, and the account of all rows."""
+    numbers, contact, press = rows.numbers, rows.contact, rows.press
+    keep, rest = contact & rows.checked.keep, ~contact & rows.checked.keep
+    # Number the blocks of rows. A block is a run of fault-free no-load rows together with the contact rows after it.
+    sound = np.flatnonzero(rows.checked.keep)
+    begins = np.zeros(len(contact), np.int64)
+    begins[sound] = np.diff(contact[sound].astype(int), prepend=1) < 0
+    block = np.cumsum(begins)
+    noload_uT = mean_by_group(rows.b_uT[rest], block[rest], int(block[-1]) + 1)
+    without = np.flatnonzero(keep & (block == 0))
     if len(without):
-        line_n = FIRST_LINE_N + without[0]
         raise CaptureError(
-            f"{where}: the press in line {line_n} has no fault-free no-load row before it. Add rows of phase noload "
-            "before this press."
+            f"{rows.where}: the press in line {FIRST_ROW + without[0]} has no fault-free no-load row before it. Add "
+            "rows of phase noload before this press."
         )
+    unknown = np.full(len(contact), np.nan)
     depth_is_zero = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
-    pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(press[keep])
     readings = make_readings(
-        header, keep, indentation=press, pass_i=pass_i, reading_i=reading_i,
+        header, keep, indentation=press,
+        pass_i=numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact), reading_i=reading_i,
         x_mm=numbers["x_mm"], y_mm=numbers["y_mm"],
         depth_mm=unknown if depth_is_zero else numbers.get("depth_mm", unknown),
         **{axis: numbers.get(axis, unknown) for axis in ("Fx_N", "Fy_N", "Fz_N", "t_s")},
-        b_uT=b_uT, noload_uT=noload_uT, temperature_degC=temperature_degC, n_contacts=header.contacts_before_n + press,
+        b_uT=rows.b_uT, noload_uT=noload_uT[block], temperature_degC=rows.temperature_degC,
+        n_contacts=header.contacts_before_n + press,
     )  # fmt: skip
     return readings, {
         "rows_n": len(readings),
         "rows_read_n": len(keep),
         "noload_rows_n": int(rest.sum()),
-        **rows.account(),
-        "ignored_columns_n": len(set(names) - set(columns)),
+        **rows.checked.account(),
         "passes_n": len(np.unique(readings.pass_i)),
         "no_depth_rows_n": len(readings) if depth_is_zero or "depth_mm" not in numbers else 0,
     }
-
-
-def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
-    if path.suffix != ".parquet":
-        head, *cells = read_cells(path, where, separator=",")
-        return [name.strip() for name in head], cells
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise CaptureError(
-            f"{where}: the file cannot be read as a Parquet file: {str(error)[:60]}. Write the file again."
-        ) from None
-    columns = [["" if value is None else str(value) for value in column.to_pylist()] for column in table.columns]
-    return list(table.column_names), [list(row) for row in zip(*columns, strict=True)]
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
@@ -153,53 +172,6 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
                 f"{where}: column {name!r} is not known, but its name resembles one of {known}. Rename the column, or "
                 "remove the column."
             )
-
-
-def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
-    """Return whether a column is optional and all its cells are empty, as in a template that was filled in partly."""
-    column_i = names.index(column)
-    return (column in OPTIONAL or column[0] == "T") and all(row[column_i].strip() in EMPTY for row in cells)
-
-
-def _to_numbers(
-    names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
-) -> Float64[np.ndarray, "f c"]:
-    """Parse the known columns as numbers.
-
-    In rows without contact, all cells except those of the field may be empty; an empty cell becomes NaN.
-    """
-    column_i = [names.index(column) for column in known]
-    may_lack = {column for column in known if column[0] != "B"}
-    picked = [[row[i].strip() for i in column_i] for row in cells]
-    lacking = np.array([[cell in EMPTY for cell in row] for row in picked], bool).reshape(len(picked), len(known))
-    lacking &= ~contact[:, None] & np.isin(known, sorted(may_lack))
-    filled = [
-        ["0" if lack else cell for cell, lack in zip(*row, strict=True)] for row in zip(picked, lacking, strict=True)
-    ]
-    numbers = to_numbers(filled, where, names=known, first_line_n=FIRST_LINE_N)
-    return np.where(lacking, np.nan, numbers)
-
-
-def _check(
-    numbers: Mapping[str, Float64[np.ndarray, " f"]],
-    b_uT: Float64[np.ndarray, "f ch"],
-    contact: Bool[np.ndarray, " f"],
-    keep: Bool[np.ndarray, " f"],
-    where: str,
-) -> None:
-    _refuse_subtracted(b_uT[keep], contact[keep], where)
-    check_fields(b_uT[keep], where, line_n=FIRST_LINE_N + np.flatnonzero(keep))
-    place_mm = np.where(contact[:, None], np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1), np.nan)
-    check_places(place_mm, where, first_line_n=FIRST_LINE_N)
-    if "depth_mm" in numbers:
-        check_depths(numbers["depth_mm"][contact], where)
-    for axis in ("Fx_N", "Fy_N", "Fz_N"):
-        if axis in numbers:
-            check_forces(numbers[axis], where, first_line_n=FIRST_LINE_N)
-            check_touch(numbers[axis][contact], where)
-    if "Fz_N" in numbers and np.median(numbers["Fz_N"][contact]) < 0:
-        got = f"{np.median(numbers['Fz_N'][contact]):.4g} N"
-        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, "Reverse the sign of Fz_N.")
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
@@ -227,30 +199,37 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Return the number of the press to which each row belongs; presses are numbered from 0.
+    """Return the number of the press to which each row belongs (see `Rows`); presses are numbered from 0.
 
     A press is a block of rows with equal values in column `indentation`. If there is no such column, a new press begins
     with each touch, and whenever the place changes within a touch.
     """
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # in rows without contact, the values of column `indentation` are ignored
-        number = numbers["indentation"][rows]
-        begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
-        firsts, counts = np.unique(number[begins], return_counts=True)
-        if (counts > 1).any():
-            twice = firsts[counts > 1][0]
-            line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
-            problem = f"indentation {twice:g} begins again in line {line_n}"
-            raise CaptureError(
-                f"{where}: {problem}; its rows must be one block. Remove rows that are in the file twice."
-            )
         begins_at = np.zeros(len(contact), bool)
-        begins_at[rows[begins]] = True
-        return np.maximum(np.cumsum(begins_at) - 1, 0)
-    place = np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)
-    elsewhere = np.r_[True, (np.abs(np.diff(place, axis=0)) > SAME_PLACE_mm).any(axis=1)]
-    begins_at = contact & (np.r_[True, ~contact[:-1]] | elsewhere)
-    return np.maximum(np.cumsum(begins_at) - 1, 0)
+        begins_at[find_blocks(numbers["indentation"], rows, where)] = True
+    else:
+        place = np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)
+        elsewhere = np.r_[True, (np.abs(np.diff(place, axis=0)) > SAME_PLACE_mm).any(axis=1)]
+        begins_at = contact & (np.r_[True, ~contact[:-1]] | elsewhere)
+    return np.minimum(np.cumsum(begins_at) - contact, begins_at.sum() - 1)
+
+
+def find_blocks(
+    indentation: Float64[np.ndarray, " f"], rows: Int[np.ndarray, " r"], where: str
+) -> Int[np.ndarray, " b"]:
+    """Return those of the rows at which another indentation begins; raise if an indentation has two blocks of rows."""
+    number = indentation[rows]
+    begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+    _, first = np.unique(number[begins], return_index=True)
+    again = np.setdiff1d(np.arange(len(begins)), first)
+    if len(again):
+        row = rows[begins[again[0]]]
+        raise CaptureError(
+            f"{where}: indentation {indentation[row]:g} begins again in line {FIRST_ROW + row}; its rows must be one "
+            "block. Remove rows that are in the file twice."
+        )
+    return rows[begins]
 
 
 def _find_passes(

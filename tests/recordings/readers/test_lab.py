@@ -139,7 +139,7 @@ def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Pa
     files = lab.collect(recording)
     assert files == {lab.READINGS: recording}
     assert lab.count_chips(files) == CHIPS_N
-    with pytest.raises(CaptureError, match="one CSV file"):
+    with pytest.raises(CaptureError, match="not a file"):
         lab.collect(tmp_path)
 
 
@@ -158,7 +158,7 @@ def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Pa
         (4, row(0, "contact", 160.0, force="0,0,-356"), "in line 4. If the unit of the file is g"),
         (4, row(0, "contact", 4e5), "in line 4"),
         (6, row(2, "contact", 90.0), "the indent from line 6 on has no fault-free noload row"),
-        (8, row(0, "noload", 90.0), "indent 0 begins again in line 8"),
+        (8, row(0, "noload", 90.0), "indentation 0 begins again in line 8"),
     ],
 )
 def test_error_names_the_line_that_cannot_be_read(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
@@ -171,7 +171,7 @@ def test_error_names_the_line_that_cannot_be_read(tmp_path: Path, line_n: int, b
 def test_error_names_the_missing_column(tmp_path: Path, missing: str) -> None:
     column = NAMES.split(",").index(missing)
     lines = [",".join(cell for i, cell in enumerate(line.split(",")) if i != column) for line in [NAMES, *PRESSES]]
-    assert f"no column {missing}" in error_of(write(tmp_path, *lines[1:], names=lines[0]))
+    assert f"no column '{missing}'" in error_of(write(tmp_path, *lines[1:], names=lines[0]))
 
 
 def test_duplicate_column_is_refused(tmp_path: Path) -> None:
@@ -203,10 +203,10 @@ def scale_column(column: str, factor: float) -> list[str]:
         ("B", 1e4, "below the full scale"),
         ("_mm", 1e-3, "places must be all equal, or spread over a range of 1 to 200 mm; got a range of 0.004. If"),
         ("_mm", 1e3, "got a range of 4000. If the unit of the file is m or um"),
-        ("F", 102.0, "force must be below 100 N; got -357 in line 4. If the unit"),
+        ("F", 102.0, "force must be below 100 N; got 357 in line 4. If the unit"),
         ("F", 1e3, "convert the forces to N"),
         ("F", 1e-3, "force must be at least 0.05 N in one or more rows with contact; got 0.0035 N at most. If"),
-        ("Fz", -1.0, "the median of Fz in contact must be negative; got 3.5 N. In layout lab, Fz is negative"),
+        ("Fz", -1.0, "Fz_N in contact must be positive; got -3.5 N. Reverse the sign"),
     ],
 )
 def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: float, expected: str) -> None:

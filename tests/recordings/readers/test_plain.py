@@ -234,4 +234,4 @@ def test_table_of_field_changes_instead_of_fields_is_refused(tmp_path):
 
 def test_error_says_that_numbers_have_decimal_commas(tmp_path):
     table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
-    assert "line 1 contains semicolons" in error_of(tmp_path)
+    assert "x_mm in line 2 must be a number" in error_of(tmp_path)

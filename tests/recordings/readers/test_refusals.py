@@ -8,19 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reskin.recordings.readers import READERS
-from tests.recordings.readers import test_eflash7, test_eflesh, test_ini, test_lab, test_leaphand, test_plain
+from tests.recordings.readers import test_eflesh, test_ini, test_lab, test_leaphand, test_plain
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "table": test_plain.write,
     "lab": lambda folder: test_lab.write(folder, *test_lab.PRESSES),
     "ini": lambda folder: test_ini.write(folder, test_ini.ONE_PASS),
     "eflesh": test_eflesh.scan,
-    "eflash7": test_eflash7.write,
     "leaphand": test_leaphand.write,
 }
 TESTS = {
-    "table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh, "eflash7": test_eflash7,
-    "leaphand": test_leaphand,
+    "table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh, "leaphand": test_leaphand,
 }  # fmt: skip
 FILES = [(layout, name) for layout, reader in READERS.items() for name in reader.FILES]  # type: ignore[attr-defined]
 WITHOUT_ROWS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f"{test_lab.NAMES}\n".encode()]

@@ -11,7 +11,7 @@ from reskin import seeds
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout
 from reskin.recordings.readers import READERS
-from reskin.recordings.tables import make_readings, read_cells
+from reskin.recordings.tables import TableFile, make_readings
 from reskin.recordings.units import check_depths, check_fields, check_forces, check_places, check_touch
 from reskin.schema import to_table
 from tests.recordings.headers import make_header
@@ -135,7 +135,7 @@ def test_depths_are_accepted_only_in_millimetres(deepest_mm: float, accepted: bo
 def test_text_that_ends_within_a_number_is_refused(tmp_path, text: str, message: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(CaptureError, match=message):
-        read_cells(tmp_path / "a.csv", "a.csv", separator=",")
+        TableFile(tmp_path / "a.csv", "a.csv")
 
 
 def test_each_layout_has_a_reader() -> None:
