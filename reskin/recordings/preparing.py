@@ -19,7 +19,7 @@ from reskin.board import stream
 from reskin.board.custom import AnyWire
 from reskin.board.wire import TEXT_WIRES
 from reskin.errors import CaptureError, ParamsError, ReskinError
-from reskin.recordings import ReaderLayout
+from reskin.recordings import ReaderLayout, column_map
 from reskin.recordings import header as headers
 from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
@@ -130,8 +130,6 @@ def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options:
 
 def mapped(recording: Path, names: CaptureNames, map_file: Path) -> Prepared:
     """Prepare a table with other columns or units, converted by a map; see `column_map`."""
-    from reskin.recordings import column_map  # needs pandas, which the library does without
-
     _check_exists(recording)
     columns = column_map.read_map(map_file)
     converted = column_map.convert(recording, columns)

@@ -223,7 +223,8 @@ class TableFile:
                 f"{self._where}: {self._rows_n} lines of values, but {start} rows: a quotation mark is not closed. "
                 "Remove it."
             )
-        return pa.table(made | {name: pa.chunked_array(part) if part else [] for name, part in parts.items()})
+        none = [pa.array([], pa.string())]
+        return pa.table(made | {name: pa.chunked_array(part or none) for name, part in parts.items()})
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:

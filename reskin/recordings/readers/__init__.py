@@ -1,4 +1,10 @@
-"""Readers of recordings in layouts other than `native`, one module per layout.
+"""Readers of recordings that other programs wrote. Which door is for what:
+
+- a table with named columns (CSV, Parquet, ...) that has the names and units of layout `table`: `table`
+- any other table or log with labels: option --columns of `reskin add`, a YAML file of its columns; `column_map`
+- bytes or lines of text as a board sends them: a layout file of its wire for option --wire; `reskin.board.custom`
+- a log without labels in the columns of an SD card: `sd_card`
+- files of a public data set: `lab` (a map of columns in Python), `ini`, `eflesh` and `leaphand`
 
 A reader converts the files of a recording to `Readings`, and counts the rows that it drops.
 """

@@ -13,6 +13,7 @@ their mean field. Joint positions are not part of `Readings`; `read_motion` retu
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -52,27 +53,15 @@ class Motion:
     noload_uT: Float64[np.ndarray, "n ch"]
 
 
-@dataclass(frozen=True)
-class _Pad:
-    """All rows of one pad, and the result of the check for faults.
-
-    The no-load rows are the `NOLOAD_ROWS_N` rows from index `first_i` on. `pads_n` is the number of pads in the file.
-    """
+class _Pad(NamedTuple):
+    """All rows of one pad, the result of the check for faults, and which rows are no-load rows and which readings."""
 
     b_uT: Float64[np.ndarray, "f ch"]
     joint_counts: Int64[np.ndarray, "f j"]
-    first_i: int
     rows: CheckedRows
-    pads_n: int
-
-    @property
-    def is_noload(self) -> Bool[np.ndarray, " f"]:
-        row_i = np.arange(len(self.b_uT)) - self.first_i
-        return (row_i >= 0) & (row_i < NOLOAD_ROWS_N) & self.rows.keep
-
-    @property
-    def is_reading(self) -> Bool[np.ndarray, " f"]:
-        return (np.arange(len(self.b_uT)) >= self.first_i + NOLOAD_ROWS_N) & self.rows.keep
+    is_noload: Bool[np.ndarray, " f"]
+    is_reading: Bool[np.ndarray, " f"]
+    pads_n: int  # in the file
 
 
 def collect(recording: Path) -> dict[str, Path]:
@@ -107,7 +96,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         "rows_n": len(readings),
         "rows_read_n": len(keep),
         "noload_rows_n": int(noload.sum()),
-        "dropped_before_noload_rows_n": int(pad.rows.keep[: pad.first_i].sum()),
+        "dropped_before_noload_rows_n": int((pad.rows.keep & ~noload & ~keep).sum()),
         **pad.rows.account(),
         "baseline_subtracted_rows_n": len(readings),
         "ignored_pads_n": pad.pads_n - 1,
@@ -139,20 +128,17 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
         row_i, joint_i = np.argwhere(wrong)[0]
         rule, got = f"whole numbers from 0 to {COUNTS_PER_TURN - 1}", f"{joint_counts[row_i, joint_i]:.6g}"
         place = f"{joints[joint_i]} in line {row_i + 1}, in counts of its servo,"
-        raise CaptureError(
-            where,
-            place,
-            rule,
-            got,
-            "The last columns must be joint positions. If they are angles, convert them to counts.",
-        )
+        remedy = "The last columns must be joint positions. If they are angles, convert them to counts."
+        raise CaptureError(where, place, rule, got, remedy)
     unknown_degC = np.full((len(b_uT), CHIPS_N), np.nan)
     rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy)
-    pad = _Pad(b_uT, joint_counts.astype(np.int64), _find_rest(joint_counts, where), rows, pads_n)
-    if not pad.is_noload.any() or not pad.is_reading.any():
-        what = "all no-load rows" if not pad.is_noload.any() else "all rows after the no-load rows"
+    after_rest = np.arange(len(b_uT)) - _find_rest(joint_counts, where)
+    is_noload = (after_rest >= 0) & (after_rest < NOLOAD_ROWS_N) & rows.keep
+    is_reading = (after_rest >= NOLOAD_ROWS_N) & rows.keep
+    if not is_noload.any() or not is_reading.any():
+        what = "all rows after the no-load rows" if is_noload.any() else "all no-load rows"
         raise CaptureError(f"{where}: {what} have faults. Check the pad, and record again.")
-    return pad
+    return _Pad(b_uT, joint_counts.astype(np.int64), rows, is_noload, is_reading, pads_n)
 
 
 def _count_pads(file: Path, where: str) -> int:
@@ -168,13 +154,8 @@ def _pad_number(header: Header, pads_n: int) -> int:
     got = header.options.get("pad", "none")
     if got not in {str(pad) for pad in range(1, pads_n + 1)}:
         rule = f"1 to {pads_n}, the number of pads in the file"
-        raise CaptureError(
-            header.capture,
-            "option pad",
-            rule,
-            got,
-            "Add each pad as a separate capture, and state the number of the pad with --pad.",
-        )
+        remedy = "Add each pad as a separate capture, and state the number of the pad with --pad."
+        raise CaptureError(header.capture, "option pad", rule, got, remedy)
     return int(got)
 
 

@@ -83,8 +83,9 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     file = TableFile(folder / name, where)
-    columns = columns_of(count_chips_of(file.names))
-    check_columns(file.names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
+    chips_n = count_chips_of(file.names)
+    columns = columns_of(chips_n)
+    check_columns(file.names, columns[: len(NEEDED) + 3 * chips_n], where, layout="table")
     _refuse_near_names(file.names, columns, where)
     known = [column for column in columns[1:] if column in file.names]
     readings, account = to_readings(check_table(file.read(known, ["phase"]), header, policy, where), header)
@@ -101,8 +102,7 @@ def check_table(table: pa.Table, header: Header, policy: FaultPolicy, where: str
     contact = contact_rows(table["phase"], where)
     fields = [f"B{axis}{chip}" for chip in range(chips_n) for axis in "xyz"]
     numbers = {name: np.asarray(table[name]) for name in table.column_names if name not in ("phase", *fields)}
-    for name in fields:
-        refuse_empty({name: np.asarray(table[name])}, np.ones(len(contact), bool), where, FIRST_ROW)
+    refuse_empty({name: np.asarray(table[name]) for name in fields}, np.ones(len(contact), bool), where, FIRST_ROW)
     # An optional column without any value is like no column, as in a template that was filled in partly.
     numbers = {name: of for name, of in numbers.items() if name in NEEDED or not np.isnan(of).all()}
     refuse_empty(numbers, contact, where, FIRST_ROW)
