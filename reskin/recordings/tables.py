@@ -11,7 +11,6 @@ import json
 import re
 import zipfile
 import zlib
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,10 +28,6 @@ from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
 COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or correct it."
-SEMICOLONS = (
-    "line 1 contains semicolons. Export the file with commas between columns, and with decimal points. Or describe the "
-    "file for option --columns of reskin add (docs/add-a-skin.md)."
-)
 NUMBER_PATTERN = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 GZIP_MARK = b"\x1f\x8b"
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -206,6 +201,7 @@ class TableFile:
             if name not in self.names:
                 have, guess = ", ".join(self.names)[:200], did_you_mean(name, self.names)
                 raise CaptureError(f"{self._where}: no column {name!r}; the file has {have}.{guess} Correct the name.")
+        _check_size(8 * self._rows_n * len(names), self._where)
         parts: dict[str, list[pa.Array]] = {name: [] for name in others}
         made: dict[str, Any] = {name: np.empty(self._rows_n) for name in names if name not in others}
         start = 0
@@ -237,7 +233,6 @@ class TableFile:
             if match := COLUMNS_N.search(problem):
                 what = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}"
                 raise CaptureError(f"{self._where}: {what}. {COPY_AGAIN}") from None
-            problem = problem or "its values are nested too deeply"
             raise CaptureError(
                 f"{self._where}: the file cannot be read as a table: {problem}. Check the file."
             ) from None
@@ -262,11 +257,19 @@ class TableFile:
         packed = start.startswith((GZIP_MARK, *UTF16_MARKS))
         text = text_of(_expanded(self._path, self._where), self._where) if packed else None
         with self._path.open("rb") if text is None else bytes_io.BytesIO(text.encode()) as file:
-            first = text_of(file.readline(), self._where).strip("\r\n")
-            last, self._rows_n = b"\n" if first else b"", 2 - self.first_row
-            while block := file.read(2**22):
+            line = block = file.readline()
+            self._rows_n = 1 - self.first_row
+            while block:
                 last, self._rows_n = block[-12:], self._rows_n + block.count(b"\n")
-        _check_end(first, last, self._where)
+                block = file.read(2**22)
+        if not line:
+            raise CaptureError(f"{self._where}: the file is empty. Copy the recording again.")
+        if not last.endswith(b"\n"):
+            raise CaptureError(
+                f"{self._where}: the last line has no line break; it ends in {last.decode(errors='replace')!a}. If the "
+                "file was cut, copy the recording again. If the last line is complete, add a line break after it."
+            )
+        first = text_of(line, self._where).strip("\r\n")
         if first.lstrip()[:1] == "{":
             lines = (text or text_of(self._path.read_bytes(), self._where)).splitlines()
             self._table = pa.Table.from_pylist([json.loads(line) for line in lines])
@@ -283,10 +286,8 @@ class TableFile:
     def _blocks(self, names: list[str]) -> Iterator[pa.RecordBatch]:
         if self._parquet is not None:
             meta = self._parquet.metadata
-            groups = [meta.row_group(i) for i in range(meta.num_row_groups)]
-            columns = [group.column(i) for group in groups for i in range(meta.num_columns)]
-            cells_n = sum(column.num_values for column in columns if column.path_in_schema.split(".")[0] in names)
-            _check_size(8 * cells_n, self._where)
+            columns = [meta.row_group(i).column(j) for i in range(meta.num_row_groups) for j in range(meta.num_columns)]
+            _check_size(8 * sum(column.num_values for column in columns), self._where)  # lists have many values a row
             texts = [name for name in names if pa.types.is_string(self._parquet.schema_arrow.field(name).type)]
             # A text that all rows share is read once, because a small file may have a long text in millions of rows.
             return pq.ParquetFile(self._path, read_dictionary=texts).iter_batches(columns=names)
@@ -374,17 +375,6 @@ def _numbers(column: pa.Array, place: str, row: int, decimal_comma: bool) -> Flo
 
 def is_number(cell: str) -> bool:
     return re.fullmatch(NUMBER_PATTERN, cell, re.ASCII) is not None and abs(float(cell)) < MAGNITUDE_MAX
-
-
-def _check_end(first: str, last: bytes, where: str) -> None:
-    """Raise if a text file is empty, or does not end with a line break."""
-    if not first and not last:
-        raise CaptureError(f"{where}: the file is empty. Copy the recording again.")
-    if not last.endswith(b"\n"):
-        raise CaptureError(
-            f"{where}: the last line has no line break; it ends in {last.decode(errors='replace')!a}. If the file "
-            "was cut, copy the recording again. If the last line is complete, add a line break after it."
-        )
 
 
 def _check_size(bytes_n: int, where: str) -> None:
@@ -495,7 +485,7 @@ def count_chips_of(names: list[str]) -> int:
 
 
 def check_columns(names: list[str], wanted: list[str], where: str, *, layout: str) -> None:
-    """Raise if one of the wanted columns is missing, or if two columns have the same name."""
+    """Raise if one of the wanted columns is missing."""
     missing = [name for name in wanted if name not in names]
     if missing:
         if renamed := _renaming(names, wanted):
@@ -505,9 +495,6 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
             "column names. See data/README.md. If the values have other names or units, describe them in a file for "
             "option --columns (docs/add-a-skin.md)."
         )
-    twice = [name for name, times_n in Counter(names).items() if times_n > 1]
-    if twice:
-        raise CaptureError(f"{where}: two columns have the name {twice[0]}. Remove one of these columns.")
 
 
 def _renaming(names: list[str], wanted: list[str]) -> str:

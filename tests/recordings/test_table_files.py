@@ -50,6 +50,8 @@ def test_large_files_are_read_in_blocks_and_name_the_line(tmp_path):
         (b"a,b\nx,1\nx\n", "line 3 has 1 columns"),
         (b"a,b\nx,1\n\xff\xfe,2\n", "cannot be read as a table"),
         (b"a,b\nx,1\nx,2", "no line break"),
+        (b"a,b", "no line break"),
+        (b"", "empty"),
         (b'{"a": "x", "b": ' + b"[" * 100_000 + b"\n", "cannot be read as a table"),
         (b'{"a": "x", "b": [1]}\n', "b: values of type list"),
         (b"PAR1" + bytes(50), "cannot be read as a table"),

@@ -171,7 +171,7 @@ def _header_fault(names: list[str]) -> str:
             f"names at the top{whole}"
         )
     if ";" in names[0]:
-        return tables.SEMICOLONS
+        return "line 1 contains semicolons. Export the file with commas between columns, and with decimal points."
     if {"phase", "x_mm", "y_mm"} & set(names):
         return (
             f"line 1 has columns of labels or estimates, but a log has only {rule}. To add labelled data, use reskin "
