@@ -108,19 +108,21 @@ def convert(recording: Path, columns: ColumnMap, where: str = "") -> pa.Table:
     sources = {name: _factors(name, column, where) for name, column in columns.columns.items()}
     parts = [part for source in sources.values() for part in source]
     listed = fields.of in file.names
-    channels = [] if listed else _channels(fields, file.names)
-    chips = range(fields.first, fields.first + max(1, _count_chips(fields, file.names)))
-    temperatures = [fields.T.replace("{}", str(chip)) for chip in chips] if fields.T else []
     by_value = isinstance(phase, str) or phase.contact is not None
     of_phase = phase if isinstance(phase, str) else phase.of
-    numbers = [*channels, *temperatures, *(of for of, factor in parts if factor is not None)]
+    # Columns of numbers and of other values are read separately, because a column may be both, such as a load that also
+    # tells contact.
     others = [of for of, factor in parts if factor is None] + [fields.of] * listed + [of_phase] * by_value
+    cells = file.read([], others)
+    lists = _listed(cells[fields.of], where) if listed else np.zeros((0, 0))
+    channels = [] if listed else _channels(fields, file.names)
+    chips = range(fields.first, fields.first + (len(lists) or len(channels)) // 3)
+    temperatures = [fields.T.replace("{}", str(chip)) for chip in chips] if fields.T else []
+    numbers = [*channels, *temperatures, *(of for of, factor in parts if factor is not None)]
     data = file.read(numbers + [of_phase] * (not by_value), decimal_comma=columns.decimal_comma)
-    cells = file.read([], others)  # one column may be both, such as a load that also tells contact
 
     made: dict[str, Any] = {}
-    b = _listed(cells[fields.of], where) if listed else [np.asarray(data[name]) for name in channels]
-    for i, values in enumerate(b):
+    for i, values in enumerate(lists if listed else (np.asarray(data[name]) for name in channels)):
         made[f"B{'xyz'[i % 3]}{i // 3}"] = UNITS["uT"][fields.unit] * fields.signs[i % 3] * values
     made |= {f"T{i}": data[name] for i, name in enumerate(temperatures)}
     for name, column in columns.columns.items():

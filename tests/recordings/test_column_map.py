@@ -94,6 +94,10 @@ def test_lists_of_fields_and_arrays_are_read(tmp_path):
     lists = RIGHT.drop(columns=FIELDS).assign(b=list(RIGHT[FIELDS].to_numpy()))
     lists.to_parquet(tmp_path / "a.parquet")
     check(converted(tmp_path, tmp_path / "a.parquet", LISTED))
+    lists.assign(T1=20.5, T2=21.5).to_parquet(tmp_path / "a.parquet")
+    found = converted(tmp_path, tmp_path / "a.parquet", LISTED.replace("{of: b}", '{of: b, T: "T{}", first: 1}'))
+    assert list(found.T0) == [20.5] * 6
+    assert list(found.T1) == [21.5] * 6
     others = {name: RIGHT[name].to_numpy() for name in ("x_mm", "y_mm", "Fz_N", "t_s")}
     np.savez(tmp_path / "a.npz", b=RIGHT[FIELDS].to_numpy(), **others)
     check(converted(tmp_path, tmp_path / "a.npz", LISTED.replace("phase: phase", "phase: {of: Fz_N, above: 0.1}")))
