@@ -165,7 +165,10 @@ OTHER_FILES = {  # first bytes of a file: what it is, and how it becomes a table
     b"MATLAB": ("a MATLAB file", "Export the table to CSV"),
 }
 EMPTY = pa.array(["", "nan", "none", "null"])  # cells without a value, in small letters
-UNREADABLE = (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError, EOFError, zipfile.BadZipFile)
+UNREADABLE = (  # errors of the libraries that read the formats, for damaged files
+    pa.ArrowException, csv.Error, zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, TypeError, KeyError,
+    AttributeError, RuntimeError, MemoryError, OverflowError,
+)  # fmt: skip
 
 
 class TableFile:

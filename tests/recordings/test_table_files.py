@@ -55,6 +55,7 @@ def test_large_files_are_read_in_blocks_and_name_the_line(tmp_path):
         (b'{"a": "x", "b": ' + b"[" * 100_000 + b"\n", "cannot be read as a table"),
         (b'{"a": "x", "b": [1]}\n', "b: values of type list"),
         (b"PAR1" + bytes(50), "cannot be read as a table"),
+        (b"a,b\rc\nx,1\n", "cannot be read as a table"),
         (b"PK\x03\x04" + bytes(50), "zip or Excel"),
         (b"\x1f\x8b" + bytes(50), "gzip file is damaged"),
     ],
@@ -64,6 +65,17 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, content, message):
     with pytest.raises(CaptureError, match=message) as caught:
         read(tmp_path / "a.csv")
     assert "\n" not in str(caught.value)
+
+
+def test_parquet_file_with_damaged_pages_is_refused_in_one_sentence(tmp_path):
+    pq.write_table(pa.table({"a": ["x"] * 50, "b": np.arange(50.0)}), tmp_path / "a.parquet", compression="snappy")
+    content = (tmp_path / "a.parquet").read_bytes()
+    for start in range(4, 400, 40):
+        (tmp_path / "a.parquet").write_bytes(content[:start] + b"\xff" * 40 + content[start + 40 :])
+        try:
+            read(tmp_path / "a.parquet")
+        except CaptureError as error:
+            assert "\n" not in str(error)
 
 
 def test_small_files_that_expand_to_large_tables_are_refused_before_they_are_read(tmp_path, monkeypatch):
