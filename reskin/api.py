@@ -702,7 +702,7 @@ def record(
     """
     from reskin.board.find import find_board
     from reskin.live.record import record_board
-    from reskin.recordings.label_sources import from_program
+    from reskin.recordings.labels import from_program
 
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}

@@ -117,6 +117,18 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def sync(*paths: Path) -> None:
+    """Wait until files, or the names in folders, are on the disk, so that they survive a power cut."""
+    for path in paths:
+        if os.name == "nt" and path.is_dir():
+            continue  # Windows cannot open folders
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
 def sha256(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -15,17 +15,17 @@ import pytest
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, SchemaError
 from reskin.recordings.header import HEADER_FILE, parse
-from reskin.recordings.label_sources import LabelSource
+from reskin.recordings.labels import LabelSource
 from reskin.recordings.preparing import CaptureNames, native
 from reskin.recordings.recorder import (
     NO_INFO,
     CaptureInfo,
+    PortSettings,
     _label_context,
     begin_capture,
     print_progress,
     record_capture,
 )
-from reskin.recordings.stream_recorder import PortSettings
 from tests.board.signals import make_frames
 from tests.stages.checkout import PROGRAMS
 
@@ -118,7 +118,7 @@ def test_error_of_a_label_source_ends_the_recording(terminal, tmp_path):
         raise CaptureError("the gauge: cannot open the port. Plug it in.")
 
     info = CaptureInfo("b0", "s0", "random", LabelSource("gauge", None, fail_to_open))
-    settings = PortSettings(115200, "binary", 5, LONG_S, None, silence_s=LONG_S, no_frame_s=LONG_S)
+    settings = PortSettings(115200, "binary", 5, LONG_S, silence_s=LONG_S, no_frame_s=LONG_S)
     with pytest.raises(CaptureError, match="the gauge: cannot open the port") as raised:
         record_capture(terminal[1], tmp_path / "run1", info=info, settings=settings, report=len, watch=len)
     assert "no bytes arrived" in str(raised.value.__cause__)

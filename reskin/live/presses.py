@@ -9,15 +9,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin import io
 from reskin.board.find import DetectedBoard
 from reskin.board.reader import Reader
 from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates
-from reskin.recordings.header import HEADER_FILE, Clock, Source, render
+from reskin.recordings.header import Clock, Source, write_header
 from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
-from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
-from reskin.recordings.stream_recorder import CaptureWriter
+from reskin.recordings.recorder import NO_INFO, CaptureWriter, begin_capture, end_capture, new_folder
 from reskin.seeds import rng_for
 from reskin.universal.layout import BoardLayout, paper_layout
 
@@ -218,7 +216,7 @@ class PageRecording:
 
     def _change_header(self, **changes: object) -> None:
         self._header = self._header.model_copy(update=changes)
-        io.write_text(self._part / HEADER_FILE, render(self._header))
+        write_header(self._part, self._header)
 
     def end(self) -> str:
         """Finish the recording; return a text for the user. Raises OSError if the header cannot be written."""

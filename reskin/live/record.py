@@ -16,7 +16,7 @@ from reskin.board.port import check_name
 from reskin.errors import ParamsError
 from reskin.live.health import Health
 from reskin.recordings.header import Source
-from reskin.recordings.label_sources import (
+from reskin.recordings.labels import (
     RANDOM,
     SNAKE,
     ForceGauge,
@@ -26,8 +26,7 @@ from reskin.recordings.label_sources import (
     from_table,
     parse_places,
 )
-from reskin.recordings.recorder import NO_INFO, new_folder, print_progress, record_capture
-from reskin.recordings.stream_recorder import PortSettings
+from reskin.recordings.recorder import NO_INFO, PortSettings, new_folder, print_progress, record_capture
 from reskin.seeds import rng_for
 
 GAUGE_BAUD = 9600
@@ -97,9 +96,7 @@ def record_board(
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
     stated: dict[str, Any] = scan | dict(names or {})
     info = replace(NO_INFO, **stated, labels=labels, source=source)
-    settings = PortSettings(
-        baud, board.wire, board.chips_n, seconds, bytes_max_n=None, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S
-    )
+    settings = PortSettings(baud, board.wire, board.chips_n, seconds, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S)
     stream, labels_summary, error = record_capture(
         board.port, folder, info=info, settings=settings,
         report=print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())]),

@@ -155,17 +155,12 @@ def render(header: Header) -> str:
     return json.dumps(header.model_dump(mode="json", exclude=without), indent=2) + "\n"
 
 
-def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if the name of a capture's folder is not the name in its header, for example because it was renamed."""
-    if header.capture != folder:
-        rule = f"the name of the folder, {folder!r}"
-        raise CaptureError(
-            f"{folder}/{HEADER_FILE}",
-            "capture",
-            rule,
-            repr(header.capture),
-            "Rename the folder to the name in the header.",
-        )
+def write_header(folder: Path, header: Header) -> None:
+    """Write the header of a capture that is being recorded; it is on the disk when the function returns."""
+    with io.replacing(folder / HEADER_FILE) as temporary:
+        temporary.write_text(render(header), encoding="utf-8")
+        io.sync(temporary)
+    io.sync(folder)
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:

@@ -29,7 +29,6 @@ from reskin.recordings.header import (
     PROBE_FILE,
     STREAM_FILE,
     Header,
-    check_same_capture,
     parse,
 )
 from reskin.recordings.probe import LABELS, ProbeLog
@@ -263,7 +262,11 @@ class OpenedCapture(NamedTuple):
 def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
     """Check a capture's header and files, and begin to read the capture; `policy` decides what happens to faults."""
     header = read_header(folder)
-    check_same_capture(header, folder.name)
+    if header.capture != folder.name:
+        raise CaptureError(
+            folder / HEADER_FILE, "capture", f"the name of the folder, {folder.name!r}", repr(header.capture),
+            "Rename the folder to the name in the header.",
+        )  # fmt: skip
     for name, digest in header.files.items():
         if not (folder / name).is_file():
             raise CaptureError(

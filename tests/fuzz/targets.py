@@ -26,8 +26,15 @@ from reskin.live.session import Session
 from reskin.models.trained import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.label_sources import Prompts, parse_places
-from reskin.recordings.labels import Dwell, DwellBuilder, GaugeLines, ProbeLogWriter, SampleTable
+from reskin.recordings.labels import (
+    Dwell,
+    DwellBuilder,
+    GaugeLines,
+    ProbeLogWriter,
+    Prompts,
+    SampleTable,
+    parse_places,
+)
 from reskin.recordings.readers import READERS, sd_card
 from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
@@ -111,7 +118,7 @@ def labels(data: bytes) -> None:
 
 def gauge(data: bytes) -> None:
     """Read the output of a force gauge, a few bytes every 10 ms."""
-    lines, dwells, cut_n = GaugeLines(), DwellBuilder(), 1 + data[0]
+    lines, dwells, cut_n = GaugeLines("gauge"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
         for i, first in enumerate(range(1, len(data), cut_n))

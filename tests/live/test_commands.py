@@ -27,7 +27,9 @@ def clock(tmp_path, monkeypatch):
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
 
-    monkeypatch.setattr("reskin.recordings.stream_recorder.time", SimpleNamespace(monotonic=monotonic, time=time.time))
+    monkeypatch.setattr(
+        "reskin.recordings.recorder.time", SimpleNamespace(monotonic=monotonic, time=time.time, strftime=time.strftime)
+    )
 
 
 def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, capsys):

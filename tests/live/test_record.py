@@ -17,8 +17,7 @@ from reskin.live.record import label_source, record_board
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, parse
 from reskin.recordings.ingest import open_capture
-from reskin.recordings.label_sources import LabelContext
-from reskin.recordings.labels import Dwell
+from reskin.recordings.labels import Dwell, LabelContext
 from reskin.recordings.preparing import CaptureNames, native
 from tests.live.boards import make_script, plugged_in
 from tests.recordings.headers import DEFAULT_POLICY

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.errors import CaptureError
-from reskin.recordings.header import NAME, Clock, Rate, check_same_capture, parse, render, write_capture
+from reskin.recordings.header import NAME, Clock, Rate, parse, render, write_capture
 from reskin.recordings.ingest import check_losses, open_capture, read_header
 from reskin.recordings.readers import READERS, lab
 from tests.recordings.headers import DEFAULT_POLICY, make_header
@@ -88,9 +88,10 @@ def test_malformed_header_is_refused(text):
     assert "\n" not in str(caught.value)
 
 
-def test_capture_in_a_renamed_folder_is_refused():
-    with pytest.raises(CaptureError, match="capture must be the name of the folder, 'other'; got 'a_capture'"):
-        check_same_capture(make_header(), "other")
+def test_capture_in_a_renamed_folder_is_refused(tmp_path):
+    write_capture(tmp_path / "other", make_header(), {})
+    with pytest.raises(CaptureError, match="the name of the folder, 'other'; got 'a_capture'"):
+        open_capture(tmp_path / "other", DEFAULT_POLICY)
 
 
 def test_header_contains_checksums_of_all_files(tmp_path):

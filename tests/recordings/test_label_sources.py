@@ -15,18 +15,19 @@ import pytest
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings import probe
 from reskin.recordings.header import PROBE_FILE
-from reskin.recordings.label_sources import (
+from reskin.recordings.labels import (
     ForceGauge,
+    Label,
     LabelContext,
     LabelSource,
     LabelThread,
+    ProbeLogWriter,
     Prompts,
     from_gauge,
     from_program,
     from_table,
     parse_places,
 )
-from reskin.recordings.labels import Label, ProbeLogWriter
 from reskin.seeds import rng_for
 
 DWELL_s = 0.002
@@ -171,8 +172,8 @@ class FakeGauge:
 def fake_gauge(monkeypatch):
     def connect(chunks):
         gauge = FakeGauge(chunks)
-        monkeypatch.setattr("reskin.recordings.label_sources.open_port", lambda *_: gauge)
-        monkeypatch.setattr("reskin.recordings.label_sources.read_waiting", FakeGauge.read)
+        monkeypatch.setattr("reskin.recordings.labels.open_port", lambda *_: gauge)
+        monkeypatch.setattr("reskin.recordings.labels.read_waiting", FakeGauge.read)
         return gauge
 
     return connect

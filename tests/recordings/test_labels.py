@@ -1,6 +1,7 @@
 """Tests that labels become a valid probe log, with equal dwells (stops of the tip) for chunks of any size."""
 
 import math
+import tracemalloc
 
 import pytest
 from hypothesis import given, settings
@@ -15,7 +16,6 @@ from reskin.recordings.labels import (
     DwellBuilder,
     GaugeLines,
     Label,
-    LineBuffer,
     ProbeLogWriter,
     SampleTable,
 )
@@ -125,6 +125,12 @@ def test_dwells_do_not_depend_on_the_size_of_chunks(chunk_n):
     assert parts[1].first_bad == "noise"
 
 
+@pytest.mark.parametrize("number", ["1_0", "\u0663", "nan", "inf", "0x1", ""])
+def test_lines_with_other_numbers_than_decimal_ones_are_counted(number):
+    _, table = dwells_of(f"t_s,phase,pass_i\n{number},contact,0\n1,contact,{number}\n")
+    assert table.bad_n == 2
+
+
 def test_table_without_phases_is_divided_by_a_threshold_of_the_force():
     forces_N = [0, 0.01] * 3 + [0.03] + [0.4] * 3
     text = "t_s,Fz_N\n" + "".join(f"{0.1 * i},{force_N}\n" for i, force_N in enumerate(forces_N))
@@ -141,18 +147,21 @@ def test_invalid_columns_are_refused(head):
 
 
 def test_lines_of_a_gauge_contain_one_or_three_numbers():
-    gauge = GaugeLines()
+    gauge = GaugeLines("gauge")
     found = gauge.feed(b"0.50\r\n0.1 -0.2; 0.7\n1,2\nERR\n0.", 3.0) + gauge.feed(b"9\n", 4.0)
     assert [(one.t_s, one.label.Fz_N) for one in found] == [(3.0, 0.5), (3.0, 0.7), (4.0, 0.9)]
     assert (found[1].label.Fx_N, found[1].label.Fy_N) == (0.1, -0.2)
     assert (gauge.bad_n, gauge.first_bad) == (2, "1,2")
 
 
-def test_line_that_never_ends_is_dropped():
-    lines = LineBuffer()
+def test_line_that_never_ends_is_counted_without_growing_memory():
+    gauge = GaugeLines("gauge")
+    tracemalloc.start()
     for _ in range(1000):
-        lines.feed(b"9" * 100)
-        assert len(lines._rest) <= 4200
+        assert gauge.feed(b"x" * 100, 0.0) == []
+    assert tracemalloc.get_traced_memory()[1] < 50_000
+    tracemalloc.stop()
+    assert gauge.bad_n == 1000 * 100 // 4100
 
 
 def test_too_short_touches_are_counted():
