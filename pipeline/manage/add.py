@@ -83,6 +83,8 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         _track(target, root)
         write_registry(root, after)
         _update_plan(root, scene, after)
+    if lost := complete.options.get("lost"):
+        say(f"warning: the recording of capture {complete.capture} was interrupted. Lost: {lost}.")
     if "compare" in (settings.model_extra or {}):
         _warn_of_departures(target, read_settings(scene, root), shared.faults)
     else:
@@ -281,7 +283,7 @@ def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator
     except ReskinError as error:
         sentence = str(error)
         for name, source in files.items():
-            for copy in (str(target / name), f"{target.name}/{name}"):
+            for copy in (str(target / name), f"{target.name}/{name}") if isinstance(source, Path) else ():
                 sentence = sentence.replace(copy, str(source))
         raise type(error)(sentence) from None
 

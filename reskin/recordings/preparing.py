@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -19,8 +20,9 @@ from reskin.board import stream
 from reskin.board.custom import AnyWire
 from reskin.board.wire import TEXT_WIRES
 from reskin.errors import CaptureError, ParamsError, ReskinError
-from reskin.recordings import ReaderLayout, column_map
+from reskin.recordings import ReaderLayout, clocks, column_map
 from reskin.recordings import header as headers
+from reskin.recordings import probe as probe_log
 from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
@@ -193,7 +195,55 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     _check_names(names)
     clock = header.clock.model_copy(update={"marks": (*marks_before, *marks)})
     named = {"capture": names.name or header.capture, "board": names.board, "skin": names.skin}
-    return header.model_copy(update=named | {"clock": clock}), files
+    header = header.model_copy(update=named | {"clock": clock})
+    return (header, files) if header.files or clock.kind != "arrivals" else _interrupted(recording, header, files)
+
+
+def _interrupted(folder: Path, header: Header, files: dict[str, Path]) -> Prepared:
+    """Prepare the whole part of a recording that was interrupted, for example by a power cut.
+
+    The end of each file may be missing or filled with zeros. The stream is cut at the last chunk that is whole and has
+    a time of arrival, and the recorder's probe log at the last contact before this time. The header says how much is
+    lost.
+    """
+    stream_file, arrivals_file = folder / headers.STREAM_FILE, folder / headers.ARRIVALS_FILE
+    stream = io.read_bytes(stream_file)
+    whole_n = len(stream.rstrip(b"\0"))  # frames of all formats end in CR LF
+    chunk_rows, rows_n = _whole_rows(arrivals_file)
+    arrivals = clocks.parse("".join(chunk_rows), str(arrivals_file))
+    chunks_n = int(np.searchsorted(arrivals.byte_end, whole_n, "right"))
+    bytes_n = int(arrivals.byte_end[chunks_n - 1]) if chunks_n else 0
+    contents: dict[str, bytes | Path] = {
+        **files,
+        headers.STREAM_FILE: stream[:bytes_n],
+        headers.ARRIVALS_FILE: "".join(chunk_rows[: 1 + chunks_n]).encode(),
+    }
+    lost = [
+        f"{len(stream) - bytes_n} of {len(stream)} bytes of {stream_file.name}",
+        f"{rows_n - chunks_n} of {rows_n} rows of {arrivals_file.name}",
+    ]
+    if (log_file := files[headers.PROBE_FILE]).parent == folder and header.clock.marks and bytes_n:
+        dwell_rows, rows_n = _whole_rows(log_file)
+        log = probe_log.parse("".join(dwell_rows), str(log_file))
+        clock = clocks.from_marks(np.array(header.clock.marks), str(folder))
+        recorded = log.contact & (log.t_end_s <= clock.probe_s(arrivals.t_s[[chunks_n - 1]]))
+        dwells_n = int(np.flatnonzero(recorded)[-1]) + 1 if recorded.any() else 0
+        contents[headers.PROBE_FILE] = "".join(dwell_rows[: 1 + dwells_n]).encode()
+        lost.append(f"{rows_n - dwells_n} of {rows_n} rows of {log_file.name}")
+        bytes_n *= dwells_n > 0
+    if not bytes_n:
+        raise CaptureError(
+            f"{folder}: the recording was interrupted before a labelled contact was whole on the disk: lost "
+            f"{', '.join(lost)}. Record again."
+        )
+    return header.model_copy(update={"options": header.options | {"lost": ", ".join(lost)}}), contents
+
+
+def _whole_rows(file: Path) -> tuple[list[str], int]:
+    """Return the whole lines of a CSV file, and the number of rows below the first line, with a torn one at the end."""
+    content = io.read_bytes(file)
+    *whole, _ = content.partition(b"\0")[0].decode(errors="replace").split("\n")
+    return [f"{line}\n" for line in whole], len(whole) - 1 + (not content.endswith(b"\n"))
 
 
 def _check_names(names: CaptureNames) -> None:
