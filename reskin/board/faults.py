@@ -67,6 +67,7 @@ OTHERS_MOVE_MIN = 0.5
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock counts as a jump
+MICROS_WRAP_S = 2**32 / 1e6  # Arduino's micros() counts to 2^32, and then again from 0
 # Assumed: repeated frames are a fault if, in a window of 40 frames (0.1 s at 400 Hz), more than 40 % of the frames
 # equal the frame before them.
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
@@ -298,6 +299,17 @@ def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"
     share, inside = (np.convolve(values, window, mode="same") for values in (same, np.ones(len(same))))
     inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # remove rounding errors
     return np.asarray(same & (share / inside > REPEATED_SHARE))
+
+
+def clock_steps(device_s: Float64[np.ndarray, " f"], last_s: float) -> Float64[np.ndarray, " f"]:
+    """Return the time since the previous frame on the board's clock, which may start again from 0 after 2^32 us."""
+    step_s = np.diff(device_s, prepend=last_s)
+    return np.where(np.abs(step_s + MICROS_WRAP_S) < CLOCK_STEP_MAX_S, step_s + MICROS_WRAP_S, step_s)
+
+
+def clock_resolution_s(device_s: Float64[np.ndarray, " f"]) -> float:
+    """Return the resolution of the board's clock, whose times in s are sent as float32: 4 ms after 9 h."""
+    return float(np.spacing(np.float32(np.abs(device_s).max())))
 
 
 def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
@@ -538,14 +550,16 @@ class FaultDetector:
             return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)
         last_s, last_device_s, last_byte = self._last or (float(t_s[0]), float(frames.device_s[0]), 0)
         self._last = float(t_s[-1]), float(frames.device_s[-1]), int(frames.end_byte[-1])
-        device_step_s = np.diff(frames.device_s, prepend=last_device_s)
+        device_step_s = clock_steps(frames.device_s, last_device_s)
+        # Between two frames, the rounded time may be wrong by the resolution.
+        counts_frames = clock_resolution_s(frames.device_s) < (MISSING_STEPS - 1) / 3 * np.median(device_step_s)
         lost_n = lost_bytes(frames.end_byte, last_byte, self._frame_bytes_n)
         usual_n = self._frame_bytes_n or int(np.median(np.diff(frames.end_byte, prepend=last_byte)))
         garbage = lost_n > GARBAGE_FRAMES_N * usual_n
         return (
             clock_jumps(device_step_s),
             silent_gaps(np.diff(t_s, prepend=last_s)),
-            missing_frames(device_step_s),
+            missing_frames(device_step_s) if counts_frames else np.zeros(len(device_step_s), np.int64),
             np.where(garbage, 0, lost_n),
             np.where(garbage, lost_n, 0),
         )

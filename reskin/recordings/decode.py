@@ -27,11 +27,12 @@ def decode_dump(data: bytes, wire: AnyWire, chips_n: int, where: str) -> tuple[p
 
 
 def read_frames(
-    table: pa.Table, rate_hz: float, where: str
+    table: pa.Table, rate_hz: float, where: str, account: dict[str, int]
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    If every frame has a time of the board's clock, these times are returned. Otherwise, times are computed from the
+    If every frame has a time of the board's clock, these times are returned; `account` says if their resolution was too
+    coarse. Otherwise, times are computed from the
     constant frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream,
     so that lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
     """
@@ -45,7 +46,9 @@ def read_frames(
     values = [np.asarray(column) for column in table.columns]
     device_s, end_byte = values[-2:]
     if np.isfinite(device_s).all():
-        t_s = device_s.astype(np.float64)
+        clock = clocks.BoardClock()
+        t_s = clock.times_of(device_s, end_byte)
+        account.update(clock.account)
     else:
         # Text frames are longer than binary frames. If any frame has the length of a binary frame, the format is
         # binary.

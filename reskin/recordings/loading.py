@@ -40,7 +40,9 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
         raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} must be above 0 and at most {RATE_MAX_HZ:g}.")
     if log.is_file():
         if io.is_parquet(log):
-            return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
+            account: dict[str, int] = {}
+            *frames, counts = sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log), account), str(log))
+            return *frames, account | counts  # type: ignore[return-value]
     return sd_card.read_log(log)
 
 

@@ -152,7 +152,7 @@ def read_recording(file: Path, rate_hz: float | None) -> Recording:
         return _of_readings(table, str(file), rate_hz)
     if "device_s" in table.column_names and rate_hz is None and not _all_finite(table["device_s"]):
         raise ParamsError(f"{file}: the frames have no times. State their rate, for example with --rate-hz 400.")
-    return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file)), str(file)))
+    return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file), {}), str(file)))
 
 
 def _of_log(

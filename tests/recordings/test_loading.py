@@ -175,3 +175,18 @@ def test_error_names_the_extra_to_install_if_pandas_is_missing(tmp_path, monkeyp
         ParamsError, match=r"load_recording: the Python package `pandas` is not installed.*'\.\[learn\]'"
     ):
         reskin.load_recording(tmp_path)
+
+
+@pytest.mark.parametrize("uptime_s", [4294.5, 30 * 3600.0])
+def test_decoded_dump_of_a_board_that_has_run_for_hours_is_loaded(tmp_path, uptime_s):
+    t_s, b_uT, temperature_degC = frames_of_board()
+    device_s = (t_s + uptime_s) % 4294.967296 if uptime_s < 5000 else t_s + uptime_s
+    data = encode(Frames(b_uT, temperature_degC, device_s, np.zeros(FRAMES_N, np.int64)), "binary-clock")
+    table, _ = decode_dump(data, "binary-clock", CHIPS_N, "dump")
+    io.write_table(tmp_path / "decoded.parquet", table)
+    frame = reskin.load_recording(tmp_path / "decoded.parquet")
+    resolution_s = float(np.spacing(np.float32(uptime_s)))
+    np.testing.assert_allclose(frame["t_s"] - frame["t_s"][0], t_s - t_s[0], rtol=0, atol=2 * resolution_s)
+    coarse = uptime_s > 5000
+    assert frame.attrs["counts"].get("coarse_clock_frames_n", 0) == coarse * FRAMES_N
+    assert frame.attrs["counts"].get("clock_resolution_us", 0) == coarse * round(1e6 * resolution_s)

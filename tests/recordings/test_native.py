@@ -278,3 +278,13 @@ def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
     (write(tmp_path, "binary") / name).unlink()
     with pytest.raises(CaptureError, match=f"{name}: file not found"):
         read(tmp_path, header_of("binary"))
+
+
+@pytest.mark.parametrize("uptime_s", [0.0, 71.5 * 60, 30 * 3600.0])
+def test_uptime_of_the_board_causes_no_faults(tmp_path: Path, uptime_s: float) -> None:
+    """The board's clock starts again from 0 after 71.6 minutes, and its resolution becomes coarse after hours."""
+    wrap_s = 2**32 / 1e6 if uptime_s < 5000 else np.inf
+    frames = dataclasses.replace(FRAMES, device_s=np.mod(FRAMES.device_s + uptime_s, wrap_s))
+    _, account = read(write(tmp_path, "binary-clock", frames), header_of("binary-clock"))
+    assert account["indentations_n"] == INDENTATIONS_N
+    assert not [key for key in account if key.startswith("fault_")]
