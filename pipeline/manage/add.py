@@ -6,13 +6,13 @@ is stopped, all changes are undone.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from pipeline import PARAMS, PLAN, SCENES
 from pipeline.catalogue import EXPERIMENTS
@@ -35,14 +35,28 @@ from reskin.errors import CaptureError, ParamsError, ReskinError, did_you_mean
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
-from reskin.recordings.orientation import other_orientation, presses_of
 from reskin.recordings.preparing import CaptureNames, Prepared
+from reskin.schema import Readings
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
 # Places of this number or more are in another unit than mm if their span is this fraction of that of the chips.
 PLACES_MIN_N, SPAN_MIN = 9, 0.2
 COMPARED_N = 3  # the places of a new capture are compared with those of this number of the scene's latest captures
+COMPARED_PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
+# Another orientation of the labels is reported if it explains at least the fraction EXPLAINED_MIN of the variance of
+# the estimated places, and if this fraction exceeds that of the unchanged labels by at least GAIN_MIN.
+EXPLAINED_MIN = GAIN_MIN = 0.5
+ORIENTATIONS = {
+    "as they are": [[1, 0], [0, 1]],
+    "with x and y swapped": [[0, 1], [1, 0]],
+    "with x mirrored": [[-1, 0], [0, 1]],
+    "with y mirrored": [[1, 0], [0, -1]],
+    "rotated by 90 degrees": [[0, -1], [1, 0]],
+    "rotated by 180 degrees": [[-1, 0], [0, -1]],
+    "rotated by 270 degrees": [[0, 1], [-1, 0]],
+    "with x and y swapped and mirrored": [[0, -1], [-1, 0]],
+}
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
@@ -270,6 +284,53 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
             f"captures only {most_common}. Check whether columns are swapped, or whether the board was rotated. The "
             "recording was added anyway."
         )
+
+
+@dataclass(frozen=True)
+class Presses:
+    """The presses of one capture: the place of each press, and the direction of its field change."""
+
+    place_mm: Float[np.ndarray, "n 2"]  # relative to the middle of all places
+    direction: Float[np.ndarray, "n ch"]  # unit vector along the mean field change
+
+
+def presses_of(blocks: Iterable[Readings]) -> Presses:
+    """Return the presses of a capture that have a known place; the readings of a press are averaged."""
+    place_mm, change_uT = [], []
+    for block in blocks:
+        known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
+        for press in np.unique(block.indentation[known]):
+            rows = known & (block.indentation == press)
+            place_mm.append([block.x_mm[rows][0], block.y_mm[rows][0]])
+            change_uT.append((block.b_uT[rows].astype(float) - block.noload_uT[rows]).mean(axis=0))
+    if not place_mm:
+        return Presses(np.zeros((0, 2)), np.zeros((0, 0)))
+    places, changes = np.array(place_mm, float), np.array(change_uT)
+    magnitude_uT = np.linalg.norm(changes, axis=1)
+    sound = np.isfinite(magnitude_uT) & (magnitude_uT > 0)
+    middle_mm = (places[sound].max(axis=0) + places[sound].min(axis=0)) / 2 if sound.any() else 0.0
+    return Presses(places[sound] - middle_mm, changes[sound] / magnitude_uT[sound, None])
+
+
+def other_orientation(own: Presses, others: Presses) -> str | None:
+    """Return how the labels of `own` must be changed to agree with those of `others`, or None.
+
+    The boards of a scene give similar readings for similar presses. Therefore, the place of each press of `own` is
+    estimated as the mean place of the three presses of `others` whose field changes have the most similar directions.
+    """
+    comparable = own.direction.shape[1:] == others.direction.shape[1:]
+    if not comparable or min(len(own.place_mm), len(others.place_mm)) < COMPARED_PRESSES_MIN_N:
+        return None
+    nearest = np.argsort(-own.direction @ others.direction.T, axis=1)[:, :3]
+    looked_up_mm = others.place_mm[nearest].mean(axis=1)
+    variance = max(float((looked_up_mm**2).mean()), 1e-12)
+    explained = {
+        name: 1 - float(((own.place_mm @ np.array(matrix).T - looked_up_mm) ** 2).mean()) / variance
+        for name, matrix in ORIENTATIONS.items()
+    }
+    best = max(explained, key=lambda name: explained[name])
+    is_better = explained[best] >= EXPLAINED_MIN and explained[best] - explained["as they are"] >= GAIN_MIN
+    return best if is_better else None
 
 
 @contextmanager

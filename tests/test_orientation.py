@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from reskin.recordings.orientation import ORIENTATIONS, Presses, other_orientation, presses_of
+from pipeline.manage.add import ORIENTATIONS, Presses, other_orientation, presses_of
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
 from tests.fields import fields_uT
