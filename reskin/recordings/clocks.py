@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Bool, Float32, Float64, Int8, Int64
+from jaxtyping import Float32, Float64, Int8, Int64
 
 from reskin.board.faults import MICROS_WRAP_S, clock_resolution_s, clock_steps
 from reskin.errors import CaptureError
@@ -87,9 +87,7 @@ def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[n
     """Return the time of each frame in s, counted from the start of the stream, if the frame rate is constant.
 
     `frame` is the position in the stream at which each frame ends, measured in frames. If all frames have the same
-    length, this is the number of bytes up to the frame's end, divided by the length of a frame; damaged bytes then also
-    count as time. If the lengths differ, it is the number of the frame, counted from 1. If frames were lost before the
-    stream was saved, all later times are too early.
+    length, damaged bytes then also count as time. Otherwise, it is the number of the frame, counted from 1.
     """
     return frame / rate_hz
 
@@ -136,34 +134,27 @@ RATE_LIMIT = 0.1
 # To align the clocks without marks, the stream is divided into time steps. For each step, the field shows whether the
 # skin was in contact; this is the contact signal. The probe log states when it should have been in contact. The offset
 # is probe time minus stream time. `_search` finds the offset at which both agree best in the first SEARCH_STEPS_N
-# steps. Then `_follow` finds one offset for each window of about WINDOW_STEPS_N steps. Finally, `_line` fits a line to
-# the offsets of the windows.
-STEPS_PER_DWELL_N = 16  # number of steps in the median contact dwell, whose duration is called a dwell length below
-# Maximum number of steps of a stream. With 1 byte per step, they take 128 MB; this is enough for 1e6 indentations of 8
-# dwell lengths each.
-STEPS_MAX_N = 2**27
-SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm accumulates to 0.2 dwell lengths
-WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
-# The match is a measure of the agreement between the contact signal and the dwells of the probe log. It must be more
-# than this fraction of its largest possible value. The fraction is 1 if the field agrees with every dwell. For a random
-# offset, it is 0 on average.
-EXPLAINED_MIN = 0.5
-# The match is counted in indentations. The best offset must match this many more indentations than every other offset.
-# If the rig repeats the same indentation periodically, an offset that is wrong by one period matches only one
-# indentation less than the right offset. One contact may also be too weak to detect. Therefore, the number exceeds 1.
+# steps. Then `_follow` finds one offset for each window of about WINDOW_STEPS_N steps, and `_line` fits a line to them.
+# How well both agree is called the match. It is counted in indentations, and is 0 on average for a random offset.
+STEPS_PER_DWELL_N = 16  # number of steps in the median contact dwell
+STEPS_MAX_N = 2**27  # maximum number of steps of a stream: 128 MB, enough for 1e6 indentations of 8 dwells each
+SEARCH_STEPS_N = 2**16  # 4,000 dwells, in which a rate error of 50 ppm accumulates to 0.2 dwells
+WINDOW_STEPS_N = 2**14  # 1,000 dwells
+EXPLAINED_MIN = 0.5  # smallest match that is accepted, as a fraction of its largest possible value
+# The best offset must match this many more indentations than every other offset. If the rig repeats the same
+# indentation periodically, an offset that is wrong by one period matches only one indentation less, and one more
+# contact may be too weak to detect. Therefore, the number exceeds 1.
 MARGIN_MIN = 1.5
-# At each offset, stream and dwells overlap in a part of the time. Offsets are ignored if this overlap is less than this
-# fraction of the largest overlap at any offset, because the few dwells in a small overlap can fit by chance.
+# Offsets at which stream and dwells overlap less than this fraction of the largest overlap are ignored, because the few
+# dwells in a small overlap can fit by chance.
 OVERLAP_MIN = 0.5
-# As a function of the offset, the match has a peak, whose top can be flat. The position of the peak is therefore taken
-# as the middle between the two offsets at which the match is 5 % below the top.
+# The peak of the match can have a flat top. The middle between the two offsets at which the match is 5 % below the top
+# is therefore taken as its position.
 PEAK_DROP = 0.05
-# A frame is in contact if the distance of its field from the no-load field exceeds this multiple of the noise. The
-# noise is the median distance of frames without contact. With 15 channels, this threshold is 2.7 standard deviations
-# above the median of these distances.
+# A frame is in contact if the distance of its field from the no-load field exceeds this multiple of the noise, which is
+# the median distance of frames without contact. With 15 channels, this is 2.7 standard deviations above the median.
 AWAY_NOISES = 1.5
-# The stream is divided into stretches, and the no-load field is updated once in each stretch. A stretch lasts about as
-# long as this many indentations.
+# The no-load field is updated in each stretch of the stream, which lasts about as long as this many indentations.
 STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4  # the no-load field at the start of the stream is the median field of this many frames
 REFERENCE_FRAMES_N = 4096  # about this many frames of a stretch, at most, are used to estimate the no-load field
@@ -246,35 +237,25 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
 class _Pattern:
     """The contact signal that is expected from the probe log.
 
-    It is positive in contact dwells, negative in no-load dwells, and 0 between dwells; its sum is 0.
+    It is positive in contact dwells, negative in no-load dwells, and 0 between dwells; its sum is 0. It is scaled so
+    that the mean total magnitude of an indentation is 1.
     """
 
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
-        weight = np.where(log.contact, 0.5 / dwell_s[log.contact].sum(), 0.5 / dwell_s[~log.contact].sum())
+        total_s = dwell_s[log.contact].sum(), dwell_s[~log.contact].sum()
         firsts = log.t_start_s[~log.contact]  # each indentation begins with its only no-load dwell
         self.start_s, self.end_s = float(log.t_start_s[0]), float(log.t_end_s[-1])
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
-        # Fraction of the time without contact.
-        self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
-        scaled = len(firsts) * weight * dwell_s  # scaled so that the mean total weight of an indentation is 1
+        self.quiet = 1 - float(total_s[0]) / (self.end_s - self.start_s)  # fraction of the time without contact
+        weight = len(firsts) * dwell_s * np.where(log.contact, 0.5 / total_s[0], -0.5 / total_s[1])
+        ends = np.cumsum(weight)
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
-        self._signed = _running(np.where(log.contact, scaled, -scaled))
-        self._unsigned = _running(scaled)
+        self._running = np.stack([ends - weight, ends], axis=1).ravel()
 
-    def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
+    def expected(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
         """Return the expected contact signal in `steps_n` steps, which begin at probe time `start_s`."""
-        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
-
-    def unsigned(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the magnitudes of the values that `signed` returns for the same arguments."""
-        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._unsigned))
-
-
-def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
-    """Return the cumulative weight at the start and at the end of each dwell."""
-    total = np.cumsum(weight)
-    return np.stack([total - weight, total], axis=1).ravel()
+        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._running))
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
@@ -283,12 +264,10 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     # In steps without a frame, the signal is 0. It is scaled to a mean magnitude of 1, so that the scale of the match
     # does not depend on the number of these steps.
     samples = signal / np.abs(signal).mean()
-    weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
-    overlap = _correlate(unsigned, np.abs(samples))
-    # The match says how well the signal agrees with the pattern at an offset. The overlap is the largest possible match
-    # at this offset. The score is the match minus the smallest match that would be accepted for this overlap. Without
-    # the second term, a wrong offset with a larger overlap could have a higher score than the right offset.
-    score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
+    expected = pattern.expected(pattern.start_s, steps_n, step_s)
+    overlap = _correlate(np.abs(expected), np.abs(samples))  # the largest possible match at each offset
+    # Without the second term, a wrong offset with a larger overlap could have a higher score than the right offset.
+    score = _correlate(expected, samples) - EXPLAINED_MIN * overlap
     score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
@@ -299,7 +278,8 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
             f"{where}: two offsets between the clocks align the contacts in the field with the probe log almost "
-            f"equally well. The two offsets differ by {margin:.2g} of {unsigned.sum():.0f} indentations. {_REMEDY}"
+            f"equally well. The two offsets differ by {margin:.2g} of {np.abs(expected).sum():.0f} indentations. "
+            f"{_REMEDY}"
         )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
@@ -310,15 +290,15 @@ def _follow(
     """Find the shift in s at which a window of the contact signal agrees best with the probe log.
 
     The shift is relative to `probe_s`, the probe time at which the window is expected to begin. Also returns the match
-    of the window with the expected signal, and the overlap of the window with the dwells. The overlap is the largest
-    possible match.
+    of the window, and its overlap with the dwells, which is the largest possible match.
     """
     reach_n = int(pattern.period_s / step_s) // 2 + 1
-    begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
+    steps_n = len(window) + 2 * reach_n
+    expected = pattern.expected(probe_s - reach_n * step_s, steps_n, step_s)
     samples = window.astype(np.float64)
-    score = _correlate(pattern.signed(begin_s, steps_n, step_s), samples)[len(samples) - 1 : steps_n]
+    score = _correlate(expected, samples)[len(samples) - 1 : steps_n]
     top_i = int(score.argmax())
-    overlap = pattern.unsigned(begin_s + top_i * step_s, len(window), step_s) @ np.abs(samples)
+    overlap = np.abs(expected[top_i : top_i + len(window)]) @ np.abs(samples)
     return (_middle(score, top_i) - reach_n) * step_s, float(score[top_i]), float(overlap)
 
 
@@ -356,49 +336,39 @@ def _contact_signal(
 ) -> tuple[float, Int8[np.ndarray, " g"]]:
     """Return the time of the first step of the stream, and the contact signal.
 
-    The contact signal has one value for each step: +1 (contact), -1 (no contact) or 0 (no frame, or undecided).
+    The contact signal has one value for each step: +1 (contact), -1 (no contact) or 0 (no frame, or undecided). A frame
+    is in contact if its field differs from the no-load field by more than noise, see `AWAY_NOISES`. The no-load field
+    is updated in each stretch of the stream, as follows. The probe log gives the fraction of time without contact. The
+    same fraction of the frames is assumed to be without contact: those whose fields are nearest to the previous no-load
+    field. The new no-load field is the mean over the nearer half of these frames. The noise is the distance from the
+    new no-load field within which half of the frames without contact lie.
     """
+    stretch_s = STRETCH_PERIODS_N * pattern.period_s
     parts: list[tuple[int, Int8[np.ndarray, " g"]]] = []
-    start_s = None
-    for t_s, contact in _detect_contact(blocks, pattern):
-        start_s = t_s[0] if start_s is None else start_s
-        step_i = (t_s - start_s) / step_s
-        if step_i[-1] > STEPS_MAX_N:
-            rule = f"at most {STEPS_MAX_N * step_s:.0f} s long, because the dwells of its probe log are so short"
-            raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
-        first_i, index_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
-        # If there are several frames in a step, the majority of these frames decides whether it is in contact.
-        parts.append((first_i, np.sign(np.bincount(index_i, np.where(contact, 1, -1))).astype(np.int8)))
-    if start_s is None:
-        raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
-    signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
-    for first_i, part in parts:
-        signal[first_i : first_i + len(part)] = part
-    return float(start_s), signal
-
-
-def _detect_contact(
-    blocks: Iterable[Block], pattern: _Pattern
-) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Yield the times of frames, and whether each frame is in contact.
-
-    A frame is in contact if its field differs from the no-load field by more than noise, see `AWAY_NOISES`. The no-load
-    field is updated in each stretch of the stream, as follows. The probe log gives the fraction of time without
-    contact. The same fraction of the frames is assumed to be without contact: those whose fields are nearest to the
-    previous no-load field. The new no-load field is the mean over the nearer half of these frames. The noise is the
-    distance from the new no-load field within which half of the frames without contact lie.
-    """
-    noload_uT, noise_uT = None, np.inf
-    for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
+    noload_uT, noise_uT, start_s = None, np.inf, 0.0
+    for t_s, b_uT in _stretches(blocks, stretch_s):
         if noload_uT is None:
-            noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
+            noload_uT, start_s = np.median(b_uT[:START_FRAMES_N], axis=0), float(t_s[0])
         # Do not update the no-load field from a short stretch, because all its frames may be in contact.
-        if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:
+        if noise_uT == np.inf or t_s[-1] - t_s[0] > stretch_s / 4:
             sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
             distance_uT = np.linalg.norm(sample - noload_uT, axis=1)
             noload_uT = sample[distance_uT <= np.quantile(distance_uT, pattern.quiet / 2)].mean(axis=0)
             noise_uT = float(np.quantile(np.linalg.norm(sample - noload_uT, axis=1), pattern.quiet / 2))
-        yield t_s, np.linalg.norm(b_uT - noload_uT, axis=1) > AWAY_NOISES * noise_uT
+        contact = np.linalg.norm(b_uT - noload_uT, axis=1) > AWAY_NOISES * noise_uT
+        if (t_s[-1] - start_s) / step_s > STEPS_MAX_N:
+            rule = f"at most {STEPS_MAX_N * step_s:.0f} s long, because the dwells of its probe log are so short"
+            raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
+        step_i = ((t_s - start_s) / step_s).astype(np.int64)
+        # If there are several frames in a step, the majority of these frames decides whether it is in contact.
+        votes = np.bincount(step_i - step_i[0], np.where(contact, 1, -1))
+        parts.append((int(step_i[0]), np.sign(votes).astype(np.int8)))
+    if not parts:
+        raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
+    signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
+    for first_i, part in parts:
+        signal[first_i : first_i + len(part)] = part
+    return start_s, signal
 
 
 def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
