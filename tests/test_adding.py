@@ -295,6 +295,19 @@ def test_recording_cannot_be_added_to_a_simulated_scene(root, lab_file):
     )
 
 
+@pytest.mark.parametrize("press_uT", [0.0, 20.0])
+def test_recording_whose_presses_do_not_change_the_field_is_named(root, tmp_path, capsys, press_uT):
+    rng = rng_for(0, "signal")
+    lines = ["phase,x_mm,y_mm,Bx0,By0,Bz0,Fz_N"]
+    for row_i in range(400):
+        press, contact = row_i // 20, row_i % 20 >= 10
+        fields = ",".join(f"{value:.2f}" for value in 500 + press_uT * contact + rng.normal(0, 4, 3))
+        lines.append(f"{'contact' if contact else 'noload'},{press % 5 * 2},{press // 5 * 2},{fields},{2.0 * contact}")
+    (tmp_path / "table.csv").write_text("\n".join(lines) + "\n")
+    add.add(root, "small", preparing.foreign(tmp_path / "table.csv", "table", labels(), {}), allow_copy=False)
+    assert ("noise" in capsys.readouterr().err) == (press_uT == 0)
+
+
 # Native captures in the following tests have two indentations with ten frames per dwell, at 400 Hz.
 FRAMES = make_frames(60, 2, seed=0)
 

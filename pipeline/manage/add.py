@@ -42,6 +42,8 @@ RAW = "data/raw"
 INDENTATIONS = "data/indentations"
 # Places of this number or more are in another unit than mm if their span is this fraction of that of the chips.
 PLACES_MIN_N, SPAN_MIN = 9, 0.2
+# Readings minus a no-load reading, both only noise, have the rms of the steps between readings, or less.
+SIGNAL_STEPS_MIN = 1.05
 COMPARED_N = 3  # the places of a new capture are compared with those of this number of the scene's latest captures
 COMPARED_PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
 # Another orientation of the labels is reported if it explains at least the fraction EXPLAINED_MIN of the variance of
@@ -198,11 +200,15 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
     rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
     passes: set[int] = set()
     indentations: set[int] = set()
+    sums = np.zeros(4)  # sums of squares and numbers of field changes, and of steps from one reading to the next
     for block in blocks:
         rows_n += len(block)
         touched |= bool((block.Fz_N != 0).any())
         readings.update(block.b_uT.tobytes())
         repeats.feed(block.b_uT)
+        change_uT = block.b_uT - block.noload_uT
+        step_uT = np.diff(block.b_uT, axis=0)[np.diff(block.indentation) == 0]
+        sums += [(change_uT**2).sum(), change_uT.size, (step_uT**2).sum(), step_uT.size]
         passes.update(np.unique(block.pass_i).tolist())
         indentations.update(np.unique(block.indentation).tolist())
     check_losses(counts, limit, folder.name)
@@ -214,6 +220,13 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in counts.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
+    change_rms_uT, step_rms_uT = np.sqrt(sums[::2] / np.maximum(sums[1::2], 1))
+    if touched and change_rms_uT < SIGNAL_STEPS_MIN * step_rms_uT:
+        say(
+            f"warning: capture {folder.name}: the presses change the field by {change_rms_uT:.2g} uT (rms), no more "
+            f"than the noise from one reading to the next ({step_rms_uT:.2g} uT). Check that the skin was on the "
+            "board, and that the labels belong to this recording. The recording was added anyway."
+        )
     if repeats.readings > REPEATED_MAX:
         say(
             f"warning: capture {folder.name}: {repeats.readings:.0%} of readings equal the reading before. Probably "

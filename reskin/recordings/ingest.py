@@ -283,7 +283,9 @@ def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
         remedy = "The log of an SD card has no labels from which a model could learn. Use: reskin predict."
         raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
     readings, account = READERS[header.layout].read(folder, header, policy)
-    return OpenedCapture(header, [readings], account)
+    times = FaultLog(policy, str(folder), "row")
+    times.record("clock_jump", np.diff(readings.t_s, prepend=-np.inf) < 0, 1 + np.arange(len(readings)))
+    return OpenedCapture(header, [readings], {**account, **times.account()})
 
 
 def read_header(folder: Path) -> Header:

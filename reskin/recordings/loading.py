@@ -151,7 +151,9 @@ def _read_table(file: Path) -> tuple[Readings, Mapping[str, int]]:
     header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
     with TemporaryDirectory() as folder:
         copy = Path(folder) / header.capture
-        return READERS["table"].read(copy, write_capture(copy, header, files), STANDARD_POLICY)
+        write_capture(copy, header, files)
+        _, (readings,), account = open_capture(copy, STANDARD_POLICY)
+        return readings, account
 
 
 READ = {"labelled": _read_labelled, "ingested": _read_ingested, "table": _read_table}

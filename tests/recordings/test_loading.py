@@ -190,3 +190,16 @@ def test_decoded_dump_of_a_board_that_has_run_for_hours_is_loaded(tmp_path, upti
     coarse = uptime_s > 5000
     assert frame.attrs["counts"].get("coarse_clock_frames_n", 0) == coarse * FRAMES_N
     assert frame.attrs["counts"].get("clock_resolution_us", 0) == coarse * round(1e6 * resolution_s)
+
+
+def test_rows_of_a_table_whose_time_goes_backwards_are_counted(tmp_path):
+    t_s, b_uT, _ = frames_of_board()
+    contact = t_s % 0.4 > 0.2
+    t_s[60:] -= 0.3
+    lines = ["phase,x_mm,y_mm,Bx0,By0,Bz0,Bx1,By1,Bz1,Fz_N,t_s"]
+    for i in range(FRAMES_N):
+        fields = ",".join(f"{value:.2f}" for value in b_uT[i])
+        lines.append(f"{'contact' if contact[i] else 'noload'},2,3,{fields},{2.0 * contact[i]},{t_s[i]:.2f}")
+    (tmp_path / "table.csv").write_text("\n".join(lines) + "\n")
+    counts = reskin.load_recording(tmp_path / "table.csv").attrs["counts"]
+    assert counts["fault_clock_jump_flagged_n"] == 1
