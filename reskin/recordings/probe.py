@@ -63,23 +63,15 @@ def parse(source: str | Path, where: str) -> ProbeLog:
         raise CaptureError(f"{where}: the probe log has no rows. Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
-        refuse_row(
-            unknown,
-            where,
-            name,
-            "known",
-            "an empty field",
-            "Fill in this field: only places, depths and forces may be empty.",
-        )
+        remedy = "Fill in this field: only places, depths and forces may be empty."
+        refuse_row(unknown, where, name, "known", "an empty field", remedy)
     phases = table.column("phase")
+    rule = f"{NOLOAD} or {CONTACT}"
     is_other = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
-    refuse_row(
-        is_other, where, "phase", f"{NOLOAD} or {CONTACT}", phases, f"Write {NOLOAD} or {CONTACT} in this field."
-    )
+    refuse_row(is_other, where, "phase", rule, phases, f"Write {rule} in this field.")
     numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
     log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
-    _check_numbers(log, where)
-    _check_order(log, where)
+    _check(log, where)
     return log
 
 
@@ -92,48 +84,24 @@ def render(log: ProbeLog) -> str:
     return tables.render_csv(pa.table(fields))
 
 
-def _check_numbers(log: ProbeLog, where: str) -> None:
+def _check(log: ProbeLog, where: str) -> None:
+    """Raise `CaptureError` for the first row with an invalid number, or in a wrong order."""
     for name in LABELS:
-        values = getattr(log, name)
-        refuse_row(
-            np.isinf(values),
-            where,
-            name,
-            "finite, or empty if unknown",
-            values,
-            "If the value is unknown, leave this field empty.",
-        )
+        values, remedy = getattr(log, name), "If the value is unknown, leave this field empty."
+        refuse_row(np.isinf(values), where, name, "finite, or empty if unknown", values, remedy)
     for name in ("t_start_s", "t_end_s"):
-        values = getattr(log, name)
-        refuse_row(~np.isfinite(values), where, name, "a finite time", values, "Correct this time, or remove the row.")
+        values, remedy = getattr(log, name), "Correct this time, or remove the row."
+        refuse_row(~np.isfinite(values), where, name, "a finite time", values, remedy)
     for name in ("indentation", "pass_i"):
         values = getattr(log, name)
         refuse_row(values < 0, where, name, "0 or more", values, "Number indentations and passes from 0.")
-
-
-def _check_order(log: ProbeLog, where: str) -> None:
     start_s, end_s, number = log.t_start_s, log.t_end_s, log.indentation
-    refuse_row(
-        end_s <= start_s,
-        where,
-        "t_end_s",
-        "later than t_start_s in the same row",
-        end_s,
-        "Correct the times in this row.",
-    )
-    overlaps = np.append(False, start_s[1:] < end_s[:-1])
-    refuse_row(
-        overlaps, where, "t_start_s", "no earlier than t_end_s in the row above", start_s, "Sort the rows by time."
-    )
-    falls = np.diff(number, prepend=number[0]) < 0
-    refuse_row(
-        falls,
-        where,
-        "indentation",
-        "no smaller than in the row above",
-        number,
-        "Do not restart the numbering in a new pass.",
-    )
+    rule = "later than t_start_s in the same row"
+    refuse_row(end_s <= start_s, where, "t_end_s", rule, end_s, "Correct the times in this row.")
+    overlaps, rule = np.append(False, start_s[1:] < end_s[:-1]), "no earlier than t_end_s in the row above"
+    refuse_row(overlaps, where, "t_start_s", rule, start_s, "Sort the rows by time.")
+    falls, rule = np.diff(number, prepend=number[0]) < 0, "no smaller than in the row above"
+    refuse_row(falls, where, "indentation", rule, number, "Do not restart the numbering in a new pass.")
     begins = np.diff(number, prepend=-1) != 0
     remedy = "Each indentation must have one row of phase noload, followed by one or more rows of phase contact."
     refuse_row(begins & log.contact, where, "the phase of the first row of an indentation", NOLOAD, CONTACT, remedy)
