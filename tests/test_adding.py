@@ -26,7 +26,7 @@ from reskin.layouts import FOLDER
 from reskin.recordings import preparing, probe
 from reskin.recordings.header import Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
-from reskin.recordings.preparing import CaptureNames, Dump
+from reskin.recordings.preparing import CaptureNames
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
@@ -205,11 +205,11 @@ def test_errors_name_the_file_that_the_user_has_given(root, tmp_path):
 def test_invalid_rate_is_an_error(root, tmp_path, rate_hz):
     for name in ("dump.bin", "probe.csv"):
         (tmp_path / name).write_bytes(b"")
-    what = Dump("binary", 2, rate_hz, tmp_path / "probe.csv", ())
-    assert_refused(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), what), "--rate-hz")
+    what = {"wire": "binary", "chips_n": 2, "rate_hz": rate_hz, "probe": tmp_path / "probe.csv"}
+    assert_refused(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), **what), "--rate-hz")
 
 
-@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1"])
+@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1", "1.2.3,1", "1_0,2", "\u0663,2"])
 def test_invalid_mark_is_an_error(text):
     with pytest.raises(ReskinError, match="--mark: a mark must be STREAM_S,PROBE_S"):
         preparing.parse_marks([text])
@@ -381,10 +381,10 @@ def test_native_capture_is_an_error_if_its_labels_or_bytes_contradict_its_header
 def test_dump_without_frames_is_an_error(root, tmp_path, damage, message):
     (tmp_path / "dump.bin").write_bytes(damage)
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
-    what = Dump("binary", 2, 400.0, tmp_path / "probe.csv", ())
+    what = {"wire": "binary", "chips_n": 2, "rate_hz": 400.0, "probe": tmp_path / "probe.csv"}
     assert_refused(
         root,
-        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), **what), allow_copy=False),
         message,
     )
 
@@ -392,14 +392,16 @@ def test_dump_without_frames_is_an_error(root, tmp_path, damage, message):
 def test_error_for_a_wrong_number_of_chips_suggests_the_right_one(root, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
-    what = Dump("binary", 5, 400.0, tmp_path / "probe.csv", ())
+    what = {"wire": "binary", "chips_n": 5, "rate_hz": 400.0, "probe": tmp_path / "probe.csv"}
     assert_refused(
         root,
-        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
+        lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), **what), allow_copy=False),
         "The bytes fit binary with 2 chips",
     )
     assert_refused(
-        root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None, ())), "Add --probe"
+        root,
+        lambda: preparing.dump(tmp_path / "dump.bin", labels(), wire="binary", chips_n=2, rate_hz=400.0, probe=None),
+        "Add --probe",
     )
 
 

@@ -50,8 +50,9 @@ class Options:
             wire = read_wire(self.wire or ("binary" if layout == "serial-binary" else "text-xyzt"))
             chips_n = wire.chips_n if isinstance(wire, CustomWire) else self.chips or 5
             rate_hz = 400.0 if self.rate_hz is None else self.rate_hz
-            dump = preparing.Dump(wire, chips_n, rate_hz, self.probe, marks)
-            return preparing.dump(recording, names, dump)
+            return preparing.dump(
+                recording, names, wire=wire, chips_n=chips_n, rate_hz=rate_hz, probe=self.probe, marks=marks
+            )
         if self.columns is not None:
             return preparing.mapped(recording, names, self.columns)
         given = {"rows_late": self.rows_late, "pad": self.pad}

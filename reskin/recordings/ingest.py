@@ -23,14 +23,7 @@ from reskin.errors import CaptureError
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals, ClockMap, from_contacts, from_marks
 from reskin.recordings.fault_policy import CheckedRows, FaultLog, FaultPolicy
-from reskin.recordings.header import (
-    ARRIVALS_FILE,
-    HEADER_FILE,
-    PROBE_FILE,
-    STREAM_FILE,
-    Header,
-    parse,
-)
+from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, Header, parse
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.readers import READERS
 from reskin.recordings.units import check_fields, check_log

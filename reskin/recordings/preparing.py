@@ -27,12 +27,12 @@ from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS, table
-from reskin.recordings.tables import count_chips_of
+from reskin.recordings.tables import NUMBER_PATTERN, count_chips_of
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # name of the board and of the skin in a recording that was made without names
 
-Marks = tuple[tuple[float, float], ...]
+Marks = tuple[tuple[float, float], ...]  # sync marks: pairs of stream time and probe time of the same event
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
 
@@ -48,20 +48,6 @@ class CaptureNames:
     name: str | None
 
 
-@dataclass(frozen=True)
-class Dump:
-    """What must be known to use a serial dump, a file that contains only the bytes of a port.
-
-    `probe` is the probe log, and `marks` are sync marks (pairs of stream time and probe time of the same event).
-    """
-
-    wire: AnyWire
-    chips_n: int
-    rate_hz: float
-    probe: Path | None
-    marks: Marks
-
-
 def parse_marks(texts: list[str]) -> Marks:
     """Parse sync marks, each of which is written as `STREAM_S,PROBE_S`.
 
@@ -70,10 +56,10 @@ def parse_marks(texts: list[str]) -> Marks:
     """
     marks = []
     for text in texts:
-        if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", text):
+        stream_s, comma, probe_s = text.partition(",")
+        if not comma or not all(re.match(NUMBER_PATTERN, number, re.ASCII) for number in (stream_s, probe_s)):
             raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(text), "Example: --mark 0,12.5")
-        stream_s, probe_s = map(float, text.split(","))
-        marks.append((stream_s, probe_s))
+        marks.append((float(stream_s), float(probe_s)))
     return tuple(marks)
 
 
@@ -143,22 +129,29 @@ def mapped(recording: Path, names: CaptureNames, map_file: Path) -> Prepared:
     return header, {table.PARQUET: content.getvalue().to_pybytes()}
 
 
-def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
-    """Prepare a serial dump and its probe log; the times of frames are computed from a constant rate."""
-    if what.probe is None:
+def dump(
+    recording: Path,
+    names: CaptureNames,
+    *,
+    wire: AnyWire,
+    chips_n: int,
+    rate_hz: float,
+    probe: Path | None,
+    marks: Marks = (),
+) -> Prepared:
+    """Prepare a serial dump, which has only the bytes of a port; the times of frames follow from a constant rate."""
+    if probe is None:
         raise CaptureError(
             f"{recording}: a serial dump needs its probe log. Add --probe PROBE.csv (columns in data/README.md)."
         )
     _check_exists(recording)
-    _check_exists(what.probe)
-    if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
+    _check_exists(probe)
+    if not 0 < rate_hz <= headers.RATE_MAX_HZ:
         rule = f"above 0 and at most {headers.RATE_MAX_HZ:g}"
-        raise CaptureError(
-            "--rate-hz", "the rate", rule, what.rate_hz, "State how many frames the board sends per second."
-        )
-    clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
-    header = _header(names, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
-    return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
+        raise CaptureError("--rate-hz", "the rate", rule, rate_hz, "State how many frames the board sends per second.")
+    clock = Clock(kind="rate", rate_hz=rate_hz, marks=marks)
+    header = _header(names, recording, layout="native", chips_n=chips_n, wire=wire, clock=clock)
+    return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: probe}
 
 
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
@@ -207,19 +200,19 @@ def _interrupted(folder: Path, header: Header, files: dict[str, Path]) -> Prepar
     lost.
     """
     stream_file, arrivals_file = folder / headers.STREAM_FILE, folder / headers.ARRIVALS_FILE
-    stream = io.read_bytes(stream_file)
-    whole_n = len(stream.rstrip(b"\0"))  # frames of all formats end in CR LF
+    data = io.read_bytes(stream_file)
+    whole_n = len(data.rstrip(b"\0"))  # frames of all formats end in CR LF
     chunk_rows, rows_n = _whole_rows(arrivals_file)
     arrivals = clocks.parse("".join(chunk_rows), str(arrivals_file))
     chunks_n = int(np.searchsorted(arrivals.byte_end, whole_n, "right"))
     bytes_n = int(arrivals.byte_end[chunks_n - 1]) if chunks_n else 0
     contents: dict[str, bytes | Path] = {
         **files,
-        headers.STREAM_FILE: stream[:bytes_n],
+        headers.STREAM_FILE: data[:bytes_n],
         headers.ARRIVALS_FILE: "".join(chunk_rows[: 1 + chunks_n]).encode(),
     }
     lost = [
-        f"{len(stream) - bytes_n} of {len(stream)} bytes of {stream_file.name}",
+        f"{len(data) - bytes_n} of {len(data)} bytes of {stream_file.name}",
         f"{rows_n - chunks_n} of {rows_n} rows of {arrivals_file.name}",
     ]
     if (log_file := files[headers.PROBE_FILE]).parent == folder and header.clock.marks and bytes_n:
@@ -249,13 +242,7 @@ def _whole_rows(file: Path) -> tuple[list[str], int]:
 def _check_names(names: CaptureNames) -> None:
     for option, name in (("--board", names.board), ("--skin", names.skin), ("--name", names.name)):
         if name is not None and not re.fullmatch(headers.NAME, name):
-            raise CaptureError(
-                option,
-                "a name",
-                headers.NAME_RULE,
-                repr(name),
-                "Choose another name.",
-            )
+            raise CaptureError(option, "a name", headers.NAME_RULE, repr(name), "Choose another name.")
 
 
 def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
