@@ -307,6 +307,9 @@ class CaptureWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._stream.close()
         self._arrivals.close()
 
