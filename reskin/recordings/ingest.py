@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from reskin import io
 from reskin.board.custom import AnyWire, frame_bytes_of
@@ -26,6 +26,7 @@ from reskin.recordings.fault_policy import CheckedRows, FaultLog, FaultPolicy
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STREAM_FILE, Header, parse
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.readers import READERS
+from reskin.recordings.tables import count_within, make_readings
 from reskin.recordings.units import check_fields, check_log
 from reskin.schema import Readings
 
@@ -86,11 +87,9 @@ def join(
     """
     joiner = Joiner(log, clock, header)
     for block in blocks:
-        readings = joiner.feed(block)
-        if len(readings):
+        if len(readings := joiner.feed(block)):
             yield readings
-    readings = joiner.close()
-    if len(readings):
+    if len(readings := joiner.close()):
         yield readings
     account.update(joiner.account())
 
@@ -180,18 +179,11 @@ class Joiner:
             indentations_n=len(noload_uT),
             dropped_no_noload_indentations_n=len(np.unique(with_contact[~paired])),
         )
-        return self._make_readings(rows, noload_uT[row_group_i], group_i)
-
-    def _make_readings(
-        self, rows: _DwellFrames, noload_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"]
-    ) -> Readings:
-        log, header = self._log, self._header
-        return Readings(
-            capture=header.capture, board=header.board, skin=header.skin, source=header.source,
-            indentation=log.indentation[rows.dwell_i], pass_i=log.pass_i[rows.dwell_i], reading_i=_rank(group_i),
-            **{name: getattr(log, name)[rows.dwell_i] for name in LABELS},
-            b_uT=rows.b_uT, noload_uT=noload_uT, temperature_degC=rows.temperature_degC, t_s=rows.t_s,
-            n_contacts=self._before_n[group_i].astype(np.int32),
+        labels = {name: getattr(self._log, name)[rows.dwell_i] for name in ("indentation", "pass_i", *LABELS)}
+        return make_readings(
+            self._header, np.ones(len(group_i), bool), **labels, reading_i=count_within(group_i), b_uT=rows.b_uT,
+            noload_uT=noload_uT[row_group_i], temperature_degC=rows.temperature_degC, t_s=rows.t_s,
+            n_contacts=self._before_n[group_i],
         )  # fmt: skip
 
     def _empty(self) -> _DwellFrames:
@@ -214,18 +206,11 @@ def _means(
     return (sums_uT / run_n[:, None]).astype(np.float32), np.searchsorted(runs_i, wanted_i)
 
 
-def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
-    """Number the rows within each run of equal `group_i`, from 0."""
-    _, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
-    return (np.arange(len(group_i)) - np.repeat(first_i, run_n)).astype(np.int32)
-
-
 BLOCK_BYTES_N = 2**22
 # In a block of frames, the temperatures of all chips at all times differ by less than this value. Larger differences
 # show that the numbers are not temperatures.
 SPREAD_MAX_degC = 10.0
-# Which keys of an account count the losses of which total. Each entry contains the key of a total, and the prefix and
-# the suffix of the keys that count losses of this total.
+# the key of a total in an account, and prefix and suffix of the keys that count its losses
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
     ("frames_n", "dropped_", "_frames_n"),
@@ -240,7 +225,7 @@ NO_LOSS = (
     "dropped_no_contact_frames_n",
 )
 
-# A function that returns the stream time of each frame. Its arguments are the frames, and the number of earlier frames.
+# returns the stream time of each frame; the arguments are the frames, and the number of earlier frames
 Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]
 
 
@@ -305,8 +290,8 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
     """Return an iterator over the readings of a native capture, and its account.
 
-    The account is complete after the iteration. If the header has no sync marks (pairs of times at which both clocks
-    recorded the same event), the stream is read twice: first to align the clocks, then to yield the readings.
+    The account is complete after the iteration. If the header has no sync marks, the stream is read twice: first to
+    align the clocks, then to yield the readings.
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
@@ -326,7 +311,7 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
 def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
     """Return the map from stream time to probe time.
 
-    It is computed from the sync marks in the header or, if there are none, from the contacts that the fields show.
+    It follows from the sync marks in the header or, if there are none, from the contacts that the fields show.
     """
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
@@ -408,11 +393,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the times of arrival of the bytes.
-
-    Raises `CaptureError` if more bytes arrived than the file of the stream contains, because then a part of the file is
-    missing.
-    """
+    """Read the times of arrival; raise if more bytes arrived than the file of the stream contains."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:
