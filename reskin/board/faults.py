@@ -1,8 +1,14 @@
 """Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-Each function detects one kind of fault. `FaultDetector` finds all kinds of faults in a stream of frames, which may be
-passed to it in several parts of any length. Two other modules decide what happens to faulty readings:
-`recordings.fault_policy` for recordings, and `live.health` for live boards.
+`FaultDetector` finds all kinds of faults in a stream of frames, which may be passed to it in parts of any length. Byte
+streams, logs and live boards use it. Tables of presses use the functions below it, because rows of a table need not
+follow one another in time. What happens to faulty readings is decided in `recordings.fault_policy`, and in
+`live.health` for live boards.
+
+- a reading of a chip that did not answer: `failed_reads`, `zero_reads`
+- a number that lost or gained digits: `find_reading_faults` (impossible for the chip), `lone_jumps` (far from others)
+- a chip that is called stuck: `StuckChips`; a channel that never changes: `ConstantChannels`
+- the step, the range and the noise of a channel: `find_lsb`, `find_reading_faults`, `step_noise_uT`
 """
 
 from typing import NamedTuple
@@ -26,6 +32,10 @@ EXTREME_MIN_uT = 4_000.0  # a field of this size is never exactly equal on three
 # A single reading is a jump if it differs from both of its neighbours by more than this, and by more than this multiple
 # of the median change between readings, and if the neighbours differ from each other by a small part of that.
 JUMP_MIN_uT, JUMP_STEPS, JUMP_AGREE, JUMP_READINGS_MIN_N = 60.0, 15.0, 0.25, 20
+# Up to this many readings in a row are jumps if one channel jumps while the others change by less than this multiple
+# of their median change between readings, or by less than this share of the smallest jump.
+JUMP_READINGS_MAX_N, JUMP_NEAR_STEPS, JUMP_NEAR = 3, 6.0, 0.1
+NORMAL_1SD = 0.683  # this share of normally distributed numbers is within one standard deviation
 RANGE_END = 0.999  # fields beyond this fraction of 2^15 steps are at the end of the range
 RANGE_MARGIN = 1.05  # a field beyond 2^15 steps by this factor is impossible
 
@@ -110,40 +120,44 @@ def failed_reads(
     return np.asarray(of_firmware | no_answer | extreme)
 
 
-def impossible_reads(b_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings that a chip cannot send with its LSB, because a field needs more than 16 bits.
+def step_noise_uT(b_uT: Float[np.ndarray, "f ch"], share: float = NORMAL_1SD) -> Float64[np.ndarray, " ch"]:
+    """Return the change between consecutive readings that a `share` of all changes of a channel does not exceed.
 
-    Such numbers come from torn lines of text. Chips with an unknown LSB (NaN) are not marked.
+    By default, this is the standard deviation of the change by noise, because presses change few of the readings.
     """
-    return np.asarray((np.abs(_by_chip(b_uT)) > RANGE_MARGIN * INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]).any(axis=2))
+    return np.asarray(np.quantile(np.abs(np.diff(b_uT.astype(np.float64), axis=0)), share, axis=0))
 
 
-def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark single readings far from both the reading before and the one after it, which agree.
+def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
+    """Mark the readings of a stream or a log that jump away from the readings before and after them, which agree.
 
-    No press is that short. Such readings come from lines whose digits were cut. The first and the last reading are
-    compared with their next two.
+    Such readings come from lines whose digits were cut. In a single reading, any channels may jump, because no press is
+    that short. In up to `JUMP_READINGS_MAX_N` successive readings, exactly one channel of the board may jump, because a
+    press changes several channels. The first and the last reading are compared with their next two.
     """
+    jumps = np.zeros(len(b_uT), bool)
     if len(b_uT) < JUMP_READINGS_MIN_N:
-        return np.zeros((len(b_uT), b_uT.shape[1] // 3), bool)
+        return jumps
     b_uT = b_uT.astype(np.float64)
-    steps_uT = np.abs(np.diff(b_uT, axis=0))
-    far_uT = np.maximum(JUMP_MIN_uT, JUMP_STEPS * np.median(steps_uT, axis=0))
+    usual_uT = step_noise_uT(b_uT, 0.5)
+    far_uT = np.maximum(JUMP_MIN_uT, JUMP_STEPS * usual_uT)
+    near_uT = np.maximum(JUMP_NEAR_STEPS * usual_uT, JUMP_MIN_uT * JUMP_NEAR)
     padded = np.concatenate([b_uT[2:3], b_uT, b_uT[-3:-2]])
-    before, here, after = padded[:-2], padded[1:-1], padded[2:]
-    agree = np.abs(after - before) <= JUMP_AGREE * np.minimum(np.abs(here - before), np.abs(here - after))
-    jumps = (np.abs(here - before) > far_uT) & (np.abs(here - after) > far_uT) & agree
-    return np.asarray(_by_chip(jumps).any(axis=2))
-
-
-def at_range_end(b_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings with a field at the end of the range of 16 bits, where values are clipped."""
-    return np.asarray((np.abs(_by_chip(b_uT)) > RANGE_END * INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]).any(axis=2))
-
-
-def is_frozen(b_uT: Float[np.ndarray, "f ch"]) -> bool:
-    """Return whether a whole board never changes, as if a library that was not started repeats one value for ever."""
-    return len(b_uT) >= STUCK_FRAMES_MIN_N and bool((b_uT == b_uT[0]).all())
+    for jumps_n in range(1, JUMP_READINGS_MAX_N + 1):
+        before, after = padded[: -jumps_n - 1], padded[jumps_n + 1 :]
+        return_uT = np.abs(after - before)
+        settled = (return_uT <= near_uT).all(axis=1)
+        is_jump = np.ones(len(before), bool)
+        for i in range(1, jumps_n + 1):
+            here = padded[i : len(padded) - jumps_n - 1 + i]
+            least_uT = np.minimum(np.abs(here - before), np.abs(here - after))
+            far = least_uT > far_uT
+            alone = settled & (far.sum(axis=1) == 1) & ((least_uT > near_uT).sum(axis=1) == 1)
+            single = (far & (return_uT <= JUMP_AGREE * least_uT)).any(axis=1) if jumps_n == 1 else alone
+            is_jump &= single | alone
+        for i in range(jumps_n):
+            jumps[i : i + len(is_jump)] |= is_jump[: len(jumps) - i]
+    return jumps
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
@@ -172,20 +186,14 @@ def find_lsb(
     return np.where(steps_uT >= step_min_uT, steps_uT, np.nan)
 
 
-def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
-    """Mark the chips that were probably reset, because their LSB is not the expected one.
-
-    `expected_lsb_uT` is the LSB along x and y, and the LSB along z. If it is None, a chip is marked if its LSB differs
-    from the median LSB of all chips, or if its LSB is that of a chip with its power-on settings. A chip whose LSB
-    cannot be detected is not marked.
-    """
-    return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
-
-
-def unusual_lsb(
+def reset_chips(
     lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
 ) -> Bool[np.ndarray, " k"]:
-    """Mark the same chips as `reset_chips`, but use an LSB that `find_lsb` has already estimated."""
+    """Mark the chips that were probably reset, because their LSB is not the expected one (x and y, z).
+
+    If `expected_lsb_uT` is None, a chip is marked if its LSB differs from the median over chips, or is that of a chip
+    with its power-on settings. A chip with an unknown LSB (NaN) is not marked.
+    """
     if expected_lsb_uT is not None:
         return _differs(lsb_uT, expected_lsb_uT)
     after_reset = ~_differs(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -265,26 +273,6 @@ class ConstantChannels:
         ]
 
 
-def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
-    """Mark temperatures outside the chip's range; unknown temperatures (NaN) are not marked."""
-    return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
-
-
-def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip in which a field component exceeds the chip's range."""
-    return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
-
-
-def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings in which a chip's field differs from that of the previous frame by more than 2^15 LSB.
-
-    Such a jump occurs if the firmware stores the field as an int16 and this number overflows. `step_uT` is the change
-    of the field from one frame to the next. Chips with an unknown LSB (NaN) are not marked.
-    """
-    wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
-    return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
-
-
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
     """Mark frames that equal the frame before them, if many other frames around them do so too.
 
@@ -331,30 +319,6 @@ def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " 
         return np.zeros(len(device_step_s), np.int64)
     late = (device_step_s > MISSING_STEPS * usual_s) & ~clock_jumps(device_step_s)
     return np.where(late, np.rint(device_step_s / usual_s) - 1, 0).astype(np.int64)
-
-
-def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames before which the board was silent for a second or more.
-
-    The board may have been unplugged, or its program may have stalled. `step_s` is the time since the previous frame.
-    See `SILENCE_S` for the two conditions.
-    """
-    usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
-    return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
-
-
-def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
-    """Count the stray bytes before each frame.
-
-    `end_byte` is the position in the stream at which each frame ends, and `first_byte` is the position at which the
-    frame before the first one ended. `frame_bytes_n` is the length of a binary frame. It is None for text frames, whose
-    lengths vary. Stray bytes are then assumed only in lines that are longer than `LONG_LINE` times the median length.
-    """
-    length_n = np.diff(end_byte, prepend=first_byte)
-    if frame_bytes_n is not None:
-        return length_n - frame_bytes_n
-    usual_n = int(np.median(length_n)) if len(length_n) else 0
-    return np.where(length_n > LONG_LINE * usual_n, length_n - usual_n, 0)
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
@@ -409,19 +373,26 @@ def find_reading_faults(
     temperature_degC: Float[np.ndarray, "f k"],
     lsb_uT: Float[np.ndarray, "k 2"] | None = None,
 ) -> ReadingFaults:
-    """Mark the faults that can be detected from a single reading, and from the LSB of each chip if it is known."""
-    failed, clipped = failed_reads(b_uT, temperature_degC), saturated(b_uT)
+    """Mark the faults that can be detected from a single reading, and from the LSB of each chip if it is known.
+
+    A field that needs more than 16 bits is impossible; such numbers come from torn lines of text. A field at the end of
+    the range of 16 bits, or of the chip, is saturated. Unknown temperatures and LSBs (NaN) mark nothing.
+    """
+    size_uT = np.abs(_by_chip(b_uT))
+    failed, saturated = failed_reads(b_uT, temperature_degC), (size_uT > B_MAX_uT).any(axis=2)
     if lsb_uT is not None:
-        failed |= impossible_reads(b_uT, lsb_uT)
-        clipped |= at_range_end(b_uT, lsb_uT)
-    return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, clipped & ~failed)
+        full_scale_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
+        failed |= (size_uT > RANGE_MARGIN * full_scale_uT).any(axis=2)
+        saturated |= (size_uT > RANGE_END * full_scale_uT).any(axis=2)
+    too_hot = (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
+    return ReadingFaults(failed, zero_reads(b_uT), too_hot & ~failed, saturated & ~failed)
 
 
 class ScaleWindow(NamedTuple):
     """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
     `first_frame` is the number of the first of these frames. Numbers start at 1, and frames with failed reads have no
-    number. `t_s` contains the times of all frames of the window. `unusual` marks the chips that `unusual_lsb` marks.
+    number. `t_s` contains the times of all frames of the window. `unusual` marks the chips that `reset_chips` marks.
     `changed` marks the chips whose LSB differs from the first LSB that was found for the same chip.
     """
 
@@ -467,6 +438,7 @@ class FaultDetector:
     expected_lsb_uT : LSB along x and y, and LSB along z; None if they are unknown.
     steps_min_n : a chip's LSB is estimated only if at least this many gaps between neighbouring values are equal; see
         `find_lsb`.
+    lsb_uT : LSB of each chip, if it is known before the first frame.
     """
 
     def __init__(
@@ -476,13 +448,14 @@ class FaultDetector:
         frame_bytes_n: int | None = None,
         expected_lsb_uT: tuple[float, float] | None = None,
         steps_min_n: int = SURE_STEPS_MIN_N,
+        lsb_uT: Float[np.ndarray, "k 2"] | None = None,
     ) -> None:
         self._expected_lsb_uT, self._steps_min_n = expected_lsb_uT, steps_min_n
         self._frame_bytes_n = frame_bytes_n
         self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
         self._windowed_n = 0  # number of frames in complete windows so far
-        self._lsb_uT = np.full((chips_n, 2), np.nan)  # LSB of each chip; NaN until known
+        self._lsb_uT = np.full((chips_n, 2), np.nan) if lsb_uT is None else lsb_uT  # NaN until known
         self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
         # the last frame's time of arrival, its time on the board's clock, and its last byte's position in the stream
         self._last: tuple[float, float, int] | None = None
@@ -495,6 +468,9 @@ class FaultDetector:
         """Process the next frames and their times in s; return their faults."""
         b_uT, chips_n = frames.b_uT, frames.temperature_degC.shape[1]
         readings = self.of_readings(frames)
+        if self._frame_bytes_n is None:  # bytes that are lost inside a binary frame shift all others, so it is no frame
+            whole = np.flatnonzero(~readings.failed_rows)
+            readings.failed_read[whole[lone_jumps(b_uT[whole])]] = True
         temperatures = np.isfinite(frames.temperature_degC)  # a board may send none
         complete = temperatures.all(axis=1) | ~temperatures.any(axis=1)
         read = np.isfinite(b_uT).all(axis=1) & complete & ~readings.failed_rows
@@ -510,7 +486,9 @@ class FaultDetector:
             last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]
-            int16_wrap[sound] = int16_wraps(step_uT, self._lsb_uT)
+            # The field jumps by more than 2^15 LSB if the firmware stores it as an int16 that overflows.
+            wrapped = np.abs(_by_chip(step_uT)) > INT16_STEPS_N * self._lsb_uT[:, [0, 0, 1]]
+            int16_wrap[sound] = wrapped.any(axis=2)
             repeated[sound] = repeated_frames(step_uT)
         self._constant.feed(b_uT[sound])
         return Faults(readings, stuck, int16_wrap, repeated, *self._find_gaps(frames, t_s), scale)
@@ -528,7 +506,7 @@ class FaultDetector:
             rows = slice(first, first + SCALE_FRAMES_N)
             lsb_uT = find_lsb(pending_uT[rows], steps_min_n=self._steps_min_n)
             changed = np.any(np.abs(lsb_uT / self._lsb_uT - 1) > LSB_TOLERANCE, axis=1)
-            unusual = unusual_lsb(lsb_uT, self._expected_lsb_uT)
+            unusual = reset_chips(lsb_uT, self._expected_lsb_uT)
             first_frame = self._windowed_n + 1
             windows.append(ScaleWindow(first_frame, pending_s[rows], lsb_uT, self._expected_lsb_uT, unusual, changed))
             self._windowed_n += SCALE_FRAMES_N
@@ -550,15 +528,19 @@ class FaultDetector:
             return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)
         last_s, last_device_s, last_byte = self._last or (float(t_s[0]), float(frames.device_s[0]), 0)
         self._last = float(t_s[-1]), float(frames.device_s[-1]), int(frames.end_byte[-1])
-        device_step_s = clock_steps(frames.device_s, last_device_s)
+        device_step_s, step_s = clock_steps(frames.device_s, last_device_s), np.diff(t_s, prepend=last_s)
         # Between two frames, the rounded time may be wrong by the resolution.
         counts_frames = clock_resolution_s(frames.device_s) < (MISSING_STEPS - 1) / 3 * np.median(device_step_s)
-        lost_n = lost_bytes(frames.end_byte, last_byte, self._frame_bytes_n)
-        usual_n = self._frame_bytes_n or int(np.median(np.diff(frames.end_byte, prepend=last_byte)))
+        usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
+        length_n = np.diff(frames.end_byte, prepend=last_byte)
+        usual_n = self._frame_bytes_n or int(np.median(length_n))
+        lost_n = length_n - usual_n
+        if self._frame_bytes_n is None:  # the lengths of lines vary
+            lost_n = np.where(length_n > LONG_LINE * usual_n, lost_n, 0)
         garbage = lost_n > GARBAGE_FRAMES_N * usual_n
         return (
             clock_jumps(device_step_s),
-            silent_gaps(np.diff(t_s, prepend=last_s)),
+            np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s)),
             missing_frames(device_step_s) if counts_frames else np.zeros(len(device_step_s), np.int64),
             np.where(garbage, 0, lost_n),
             np.where(garbage, lost_n, 0),

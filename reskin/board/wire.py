@@ -41,7 +41,7 @@ class Frames:
     def __len__(self) -> int:
         return len(self.end_byte)
 
-    def where(self, rows: Bool[np.ndarray, " f"]) -> "Frames":
+    def where(self, rows: Bool[np.ndarray, " f"] | slice) -> "Frames":
         """Return the frames that `rows` marks."""
         return Frames(*(getattr(self, field.name)[rows] for field in fields(self)))
 

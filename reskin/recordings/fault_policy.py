@@ -1,13 +1,14 @@
 """Decide what happens to the faults of a recording, according to a policy with one action for each kind of fault.
 
 There are three actions: drop the faulty readings; flag them, which means to keep and count them; or refuse the whole
-recording. `FaultLog` applies the policy to a stream, which may be passed in several parts of any length. `check_rows`
-applies it to a whole table. Both count the faults.
+recording. `FaultLog` applies the policy to a stream, which may be passed in several parts of any length. `check_log`
+applies it to a log, and `check_rows` to a table of presses. All count the faults.
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -15,18 +16,29 @@ from jaxtyping import Bool, Float, Float64, Int
 
 from reskin.board.faults import (
     GRID_ROWS_N,
+    SCALE_FRAMES_N,
+    STUCK_FRAMES_MIN_N,
     ConstantChannels,
+    FaultDetector,
     Faults,
     ReadingFaults,
     find_lsb,
     find_reading_faults,
-    is_frozen,
+    reset_chips,
     stuck_chips,
-    unusual_lsb,
 )
+from reskin.board.wire import Frames, concatenate
 from reskin.config import Strict
 from reskin.errors import CaptureError, ParamsError, did_you_mean
+from reskin.recordings.units import check_fields
 
+# Statistics of a log (rate, LSB of the chips) are those of its first frames, so that a log of any length can be read in
+# blocks. At 400 Hz, these are 11 minutes.
+LOG_HEAD_FRAMES_N, LOG_BLOCK_FRAMES_N = 2**18, 2**16
+# Assumed limits of the frame rate: no board logs at a lower rate, and no chip measures at a higher rate.
+RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
+KEPT_SHARE_MIN = 0.5  # assumed: if a smaller share of the frames is fault-free, contacts of the log would be missed
+GAP_FRAMES = 1.5  # frames are missing if the time between two frames exceeds the median time by this factor
 USUAL_LSB = "the LSB of the other chips, and not the LSB of a chip with its power-on settings"
 
 Action = Literal["drop", "flag", "refuse"]
@@ -105,7 +117,8 @@ def reading_faults_of_table(
     """
     sound = ~find_reading_faults(b_uT, temperature_degC).faulty_rows
     found = find_reading_faults(b_uT, temperature_degC, find_lsb(b_uT[sound]))
-    if is_frozen(b_uT[~found.failed_rows]):
+    read_uT = b_uT[~found.failed_rows]
+    if len(read_uT) >= STUCK_FRAMES_MIN_N and (read_uT == read_uT[0]).all():
         raise CaptureError(
             f"{where}: every reading is the same, so the board or the library that reads it repeats one value. Check "
             "that the library is started and that the chips answer, and record again."
@@ -333,7 +346,7 @@ def check_rows(
         without_grid = np.isnan(lsb_uT).any(axis=1)
         without_grid &= (not without_grid.all()) & (len(block) >= GRID_ROWS_N)
         log.record_scale(
-            unusual_lsb(lsb_uT, expected_lsb_uT) | without_grid, np.where(without_grid[:, None], np.nan, lsb_uT),
+            reset_chips(lsb_uT, expected_lsb_uT) | without_grid, np.where(without_grid[:, None], np.nan, lsb_uT),
             expected_lsb_uT, f"{where} from row {row[block[0]]}", USUAL_LSB, row[block],
         )  # fmt: skip
     constant = ConstantChannels(temperature_degC.shape[1])
@@ -342,3 +355,104 @@ def check_rows(
     stuck = log.record("stuck", stuck_chips(b_uT).any(axis=1) & read, row) & ~failed
     out_of_range &= ~stuck
     return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, log.account())
+
+
+def check_log(blocks: Iterable[Frames], where: str, account: dict[str, int]) -> Iterator[Frames]:
+    """Yield the fault-free frames of a log, and count the others in `account`.
+
+    A log is checked like a stream of text. In `blocks`, `device_s` is the time of each frame, and `end_byte` is the
+    number of its row, which errors name. The first part that is yielded consists of the frames among the first
+    `LOG_HEAD_FRAMES_N`. Statistics of the log are those of these frames. The result does not depend on the sizes of the
+    blocks. In the account, `gaps_n` is the number of times between two frames that are so long that frames must be
+    missing, and `gap_frames_n` is the number of these frames.
+
+    Raises
+    ------
+    CaptureError
+        If times do not increase, if less than half of the frames is fault-free, if the fields are not in uT, or for a
+        fault that `STANDARD_POLICY` refuses.
+    """
+    parts = _divide(blocks, LOG_HEAD_FRAMES_N, LOG_BLOCK_FRAMES_N)
+    head = next(parts, None)
+    if head is None or len(head) < 2:
+        raise CaptureError(f"{where}: the log has fewer than two lines below the column names. Copy the log again.")
+    _check_order(np.nan, head, where)
+    step_s = float(np.median(np.diff(head.device_s)))
+    if not RATE_MIN_HZ <= 1 / step_s <= RATE_MAX_HZ:
+        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines per second"
+        remedy = "t_s must be in seconds. If it is in milliseconds, convert it."
+        raise CaptureError(where, "the rate", rule, f"{1 / step_s:.3g}", remedy)
+    failed = reading_faults_of_table(head.b_uT, head.temperature_degC, where).failed_rows
+    if failed.all():
+        raise CaptureError(f"{where}: in every line, the I2C read of a chip failed. Check the wiring, and log again.")
+    lsb_uT = find_lsb(head.b_uT[~failed])
+    detector = FaultDetector(head.temperature_degC.shape[1], lsb_uT=lsb_uT)
+    log, last_s = FaultLog(STANDARD_POLICY, where, "ms"), np.nan
+    if len(head) < SCALE_FRAMES_N:  # the detector checks the LSB of longer logs
+        log.record_scale(reset_chips(lsb_uT, None), lsb_uT, None, where, USUAL_LSB, head.device_s)
+    counts = dict.fromkeys(
+        ("gaps_n", "gap_frames_n", "rows_read_n", "dropped_failed_read_rows_n", "dropped_stuck_chip_rows_n", "rows_n"),
+        0,
+    )
+    for part in chain([head], parts):
+        t_s = part.device_s
+        _check_order(last_s, part, where)
+        steps = np.diff(t_s, prepend=last_s) / step_s
+        last_s, first_n = float(t_s[-1]), counts["rows_read_n"]
+        numbers = first_n + 1 + np.arange(len(part))
+        numbered = replace(part, device_s=np.full(len(part), np.nan), end_byte=numbers)
+        checked = log.apply(detector.feed(numbered, t_s), t_s)
+        found = {
+            "gaps_n": int((steps > GAP_FRAMES).sum()),
+            "gap_frames_n": int((np.round(steps[steps > GAP_FRAMES]) - 1).sum()),
+            "rows_read_n": len(part),
+            "dropped_failed_read_rows_n": int(checked.failed.sum()),
+            "dropped_stuck_chip_rows_n": int(checked.stuck.sum()),
+            "rows_n": int(checked.keep.sum()),
+        }
+        counts = {name: n + found[name] for name, n in counts.items()}
+        kept = part.where(checked.keep)
+        if not first_n:
+            _check_kept(counts, where)
+            check_fields(kept.b_uT, where, line_n=kept.end_byte)
+        yield kept
+    _check_kept(counts, where)
+    log.record_constant(detector.constant_channels())
+    account.update(counts | log.account())
+
+
+def _divide(blocks: Iterable[Frames], first_n: int, then_n: int) -> Iterator[Frames]:
+    """Join and cut blocks of frames to a first block of `first_n` frames, and further blocks of `then_n` frames."""
+    pending: list[Frames] = []
+    wanted_n = first_n
+    for block in blocks:
+        pending.append(block)
+        if sum(map(len, pending)) >= wanted_n:
+            whole, start = concatenate(pending, 0), 0
+            while len(whole) - start >= wanted_n:
+                yield whole.where(slice(start, start + wanted_n))
+                start, wanted_n = start + wanted_n, then_n
+            pending = [whole.where(slice(start, None))]
+    if sum(map(len, pending)):
+        yield concatenate(pending, 0)
+
+
+def _check_order(last_s: float, frames: Frames, where: str) -> None:
+    """Raise unless each time is later than the one before; `last_s` is the time before the first (NaN if none)."""
+    before_s = np.concatenate([[last_s], frames.device_s[:-1]])
+    back = frames.device_s <= before_s
+    if back.any():
+        i = int(back.argmax())
+        got = f"{frames.device_s[i]:.4f} after {before_s[i]:.4f}"
+        remedy = "If the board was reset here, split the log into two files before this line."
+        raise CaptureError(f"{where} row {frames.end_byte[i]}", "t_s", "later than the line above", got, remedy)
+
+
+def _check_kept(counts: Mapping[str, int], where: str) -> None:
+    read_n, kept_n = counts["rows_read_n"], counts["rows_n"]
+    if kept_n < max(2, KEPT_SHARE_MIN * read_n):
+        failed_n, stuck_n = counts["dropped_failed_read_rows_n"], counts["dropped_stuck_chip_rows_n"]
+        raise CaptureError(
+            f"{where}: only {kept_n} of {read_n} lines are fault-free: {failed_n} had failed I2C reads, and {stuck_n} "
+            f"had stuck chips. At least {100 * KEPT_SHARE_MIN:g} % must be fault-free. Check the wiring, and log again."
+        )

@@ -86,7 +86,7 @@ class TestScale:
     def test_find_lsb_returns_nan_for_values_that_were_not_rounded(self, seed):
         field_uT = 5.0 * seeds.rng_for(seed, "smooth").standard_normal((400, 6))
         assert np.isnan(faults.find_lsb(field_uT)).all()
-        assert not faults.reset_chips(field_uT, None).any()
+        assert not faults.reset_chips(faults.find_lsb(field_uT), None).any()
 
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 4), st.integers(0, 1000))
     def test_chip_with_power_on_settings_is_found(self, name, chip_i, seed):
@@ -94,29 +94,35 @@ class TestScale:
         grids_uT[chip_i] = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid(grids_uT, 400, seed)
         expected = [i == chip_i for i in range(5)]
-        assert faults.reset_chips(b_uT, None).tolist() == expected
-        assert faults.reset_chips(b_uT, GRIDS_uT[name]).tolist() == expected
+        assert faults.reset_chips(faults.find_lsb(b_uT), None).tolist() == expected
+        assert faults.reset_chips(faults.find_lsb(b_uT), GRIDS_uT[name]).tolist() == expected
 
     def test_step_at_power_on_is_accepted_if_it_is_expected(self):
         grid_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid([grid_uT] * 5, 400, 0)
-        assert faults.reset_chips(b_uT, None).all()
-        assert not faults.reset_chips(b_uT, grid_uT).any()
+        assert faults.reset_chips(faults.find_lsb(b_uT), None).all()
+        assert not faults.reset_chips(faults.find_lsb(b_uT), grid_uT).any()
 
     def test_chips_with_power_on_settings_in_real_recordings_are_found(self, shared_data):
         one_chip, _ = load_ini(shared_data, "faults/b20_artillery_AFG_test_new_board15.head400.txt")
         all_chips, _ = load_ini(shared_data, "faults/b20_artillery_piezo.head400.txt")
-        assert faults.reset_chips(one_chip, None).tolist() == [False, False, False, True, False]
-        assert faults.reset_chips(one_chip, GRIDS_uT["ini"]).tolist() == [False, False, False, True, False]
-        assert faults.reset_chips(all_chips, None).all()
+        assert faults.reset_chips(faults.find_lsb(one_chip), None).tolist() == [False, False, False, True, False]
+        assert faults.reset_chips(faults.find_lsb(one_chip), GRIDS_uT["ini"]).tolist() == [
+            False,
+            False,
+            False,
+            True,
+            False,
+        ]
+        assert faults.reset_chips(faults.find_lsb(all_chips), None).all()
 
     def test_no_fault_is_found_on_real_working_boards(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt", slice(0, 8000))
         for first in range(0, len(b_uT), 400):
-            assert not faults.reset_chips(b_uT[first : first + 400], None).any()
+            assert not faults.reset_chips(faults.find_lsb(b_uT[first : first + 400]), None).any()
         for file in sorted((shared_data / "lab").glob("*.csv")):
             b_uT = np.loadtxt(file, delimiter=",", skiprows=1, usecols=[5, 6, 7, 9, 10, 11], max_rows=800)
-            assert not faults.reset_chips(b_uT, None).any()
+            assert not faults.reset_chips(faults.find_lsb(b_uT), None).any()
             np.testing.assert_allclose(faults.find_lsb(b_uT), [GRIDS_uT["lab"]] * 2, rtol=0.02)
 
 

@@ -140,14 +140,12 @@ def test_frames_with_failed_reads_and_stuck_chips_are_dropped(log):
     assert not np.isclose(read_s, t_s[3]).any()
 
 
-def test_chip_with_power_on_settings_is_refused(log):
-    t_s, b_uT, temperature_degC = random_log(frames_n=400, chips_n=3)
+@pytest.mark.parametrize("frames_n", [200, 400])
+def test_chip_with_power_on_settings_is_refused(log, frames_n):
+    t_s, b_uT, temperature_degC = random_log(frames_n=frames_n, chips_n=3)
     b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
     log.write_text(render(t_s, b_uT, temperature_degC))
-    with pytest.raises(
-        CaptureError,
-        match="from row 2 on, the LSB .the step between values. of chip 1 differs from that of the other chips",
-    ):
+    with pytest.raises(CaptureError, match="the LSB of chip 1 must be"):
         read_log(log)
 
 

@@ -9,27 +9,21 @@ from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
-from reskin.board import faults
+from reskin.board.wire import Frames, concatenate
 from reskin.errors import CaptureError
 from reskin.recordings import tables
-from reskin.recordings.fault_policy import reading_faults_of_table
+from reskin.recordings.fault_policy import check_log
 from reskin.recordings.tables import FIRST_ROW
-from reskin.recordings.units import check_fields
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
-# Assumed limits of the frame rate: no board logs at a lower rate, and no chip measures at a higher rate.
-RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
 SHOWN_CHIPS_MAX = 5  # if there are more chips, the line of column names is too long for an error message
-# Assumed: if a smaller fraction of the frames is fault-free, the log is refused, because contacts would be missed.
-KEPT_SHARE_MIN = 0.5
 TORN_SHARE_MAX = 0.5  # assumed: with a larger share of torn lines, the log is refused
 # times in s, fields in uT, temperatures in degC, and an account (counts by name)
 Log = tuple[Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]]
-GAP_FRAMES = 1.5  # frames are missing if the time between two frames exceeds the median time by this factor
 
 
 def column_names(chips_n: int, *, temperatures: bool = True) -> list[str]:
@@ -55,10 +49,8 @@ def render(
 def read_log(path: Path) -> Log:
     """Read a log; return its fault-free frames, and an account.
 
-    Temperatures are NaN if the log has none. Frames with failed reads or stuck chips are dropped and counted. Raises
-    `CaptureError` if fewer than half of the frames remain, or if a chip lost its settings. A gap is a time between two
-    frames that is so long that frames must be missing. In the account, `gaps_n` is the number of gaps, and
-    `gap_frames_n` is the number of frames that are missing in all gaps together.
+    Temperatures are NaN if the log has none. Torn lines are dropped and counted, and so are the frames that
+    `fault_policy.check_log` does not accept.
     """
     where = str(path)
     names = _read_names(path, where)
@@ -94,30 +86,10 @@ def keep_whole(
     `row_n` are the numbers of the rows in errors; by default, rows are numbered from 1.
     """
     row_n = 1 + np.arange(len(t_s)) if row_n is None else row_n
-    _check_time(t_s, where, row_n)
-    failed, stuck = _faults(b_uT, temperature_degC, where, row_n)
-    whole = ~failed & ~stuck
-    account = _gaps(t_s) | {
-        "rows_read_n": len(t_s),
-        "dropped_failed_read_rows_n": int(failed.sum()),
-        "dropped_stuck_chip_rows_n": int(stuck.sum()),
-        "rows_n": int(whole.sum()),
-    }
-    _check_kept(account, where)
-    check_fields(b_uT[whole], where, line_n=row_n[whole])
-    return t_s[whole], b_uT[whole], temperature_degC[whole], account
-
-
-def _check_kept(account: dict[str, int], where: str) -> None:
-    """Raise if too few fault-free frames remain; the error states how many frames have each fault."""
-    read_n, kept_n = account["rows_read_n"], account["rows_n"]
-    if kept_n < max(2, KEPT_SHARE_MIN * read_n):
-        failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
-        counts = f"{failed_n} had failed I2C reads, and {stuck_n} had stuck chips"
-        raise CaptureError(
-            f"{where}: only {kept_n} of {read_n} lines are fault-free: {counts}. At least "
-            f"{100 * KEPT_SHARE_MIN:g} % must be fault-free. Check the wiring, and log again."
-        )
+    account: dict[str, int] = {}
+    parts = list(check_log([Frames(b_uT, temperature_degC, t_s, row_n)], where, account))
+    kept = concatenate(parts, temperature_degC.shape[1])
+    return kept.device_s, kept.b_uT, kept.temperature_degC, account
 
 
 def _read_names(path: Path, where: str) -> list[str]:
@@ -184,52 +156,3 @@ def _header_fault(names: list[str]) -> str:
         )
     got = ascii(names[wrong_i][:20])[1:-1]
     return f"line 1: column {wrong_i + 1} is {got!r}; it must be {wanted[wrong_i]} (columns: {rule}). Correct line 1."
-
-
-def _check_time(t_s: Float64[np.ndarray, " f"], where: str, row_n: Int64[np.ndarray, " f"]) -> None:
-    if len(t_s) < 2:
-        raise CaptureError(f"{where}: the log has fewer than two lines below the column names. Copy the log again.")
-    back = np.diff(t_s) <= 0
-    if back.any():
-        row_i = int(back.argmax()) + 1
-        got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
-        remedy = "If the board was reset here, split the log into two files before this line."
-        raise CaptureError(f"{where} row {row_n[row_i]}", TIME, "later than the line above", got, remedy)
-    rate_hz = 1 / float(np.median(np.diff(t_s)))
-    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
-        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines per second"
-        remedy = f"{TIME} must be in seconds. If it is in milliseconds, convert it."
-        raise CaptureError(where, "the rate", rule, f"{rate_hz:.3g}", remedy)
-
-
-def _faults(
-    b_uT: Float32[np.ndarray, "f ch"],
-    temperature_degC: Float32[np.ndarray, "f k"],
-    where: str,
-    row_n: Int64[np.ndarray, " f"],
-) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-    """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
-    failed = reading_faults_of_table(b_uT, temperature_degC, where).failed_rows
-    failed[~failed] = faults.lone_jumps(b_uT[~failed]).any(axis=1)
-    if failed.all():
-        raise CaptureError(f"{where}: in every line, the I2C read of a chip failed. Check the wiring, and log again.")
-    read = np.flatnonzero(~failed)
-    for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
-        deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))
-        if len(deviating):
-            problem = (
-                f"the LSB (the step between values) of chip {', '.join(map(str, deviating))} differs from that of the "
-                "other chips"
-            )
-            raise CaptureError(
-                f"{where}: from row {row_n[block[0]]} on, {problem}. A chip has probably lost its settings: reset "
-                "the board and log again."
-            )
-    return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
-
-
-def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
-    """Count the gaps (times between two frames in which frames must be missing), and the frames missing in them."""
-    steps = np.diff(t_s) / np.median(np.diff(t_s))
-    wide = steps > GAP_FRAMES
-    return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}
