@@ -8,7 +8,7 @@ follow one another in time. What happens to faulty readings is decided in `recor
 - a reading of a chip that did not answer: `failed_reads`, `zero_reads`
 - a number that lost or gained digits: `find_reading_faults` (impossible for the chip), `lone_jumps` (far from others)
 - a chip that is called stuck: `StuckChips`; a channel that never changes: `ConstantChannels`
-- the step, the range and the noise of a channel: `find_lsb`, `find_reading_faults`, `step_noise_uT`
+- the step, the range and the noise of a channel: `find_lsb`, `find_reading_faults`, `lone_jumps`
 """
 
 from typing import NamedTuple
@@ -29,13 +29,10 @@ FAILED_TOLERANCE = 0.01  # a reading counts as failed if it differs by less, bec
 # large as one along x and y (data sheet of the MLX90393, table 17), or equal in other chips.
 STEP_MAX_uT, STEP_RATIO, STEP_RATIO_OFF = 10.0, 1.3, 0.35
 EXTREME_MIN_uT = 4_000.0  # a field of this size is never exactly equal on three axes
-# A single reading is a jump if it differs from both of its neighbours by more than this, and by more than this multiple
-# of the median change between readings, and if the neighbours differ from each other by a small part of that.
-JUMP_MIN_uT, JUMP_STEPS, JUMP_AGREE, JUMP_READINGS_MIN_N = 60.0, 15.0, 0.25, 20
-# Up to this many readings in a row are jumps if one channel jumps while the others change by less than this multiple
-# of their median change between readings, or by less than this share of the smallest jump.
-JUMP_READINGS_MAX_N, JUMP_NEAR_STEPS, JUMP_NEAR = 3, 6.0, 0.1
-NORMAL_1SD = 0.683  # this share of normally distributed numbers is within one standard deviation
+# A value is far from the median of the readings around it if it differs by more than JUMP_MIN_uT and by more than the
+# given multiple of the median change between readings. It is near if it differs by less than the other two limits.
+JUMP_MIN_uT, JUMP_STEPS, JUMP_NEAR, JUMP_NEAR_STEPS = 60.0, 15.0, 0.1, 6.0
+JUMP_WINDOW_N, JUMP_READINGS_MIN_N = 7, 20
 RANGE_END = 0.999  # fields beyond this fraction of 2^15 steps are at the end of the range
 RANGE_MARGIN = 1.05  # a field beyond 2^15 steps by this factor is impossible
 
@@ -120,44 +117,32 @@ def failed_reads(
     return np.asarray(of_firmware | no_answer | extreme)
 
 
-def step_noise_uT(b_uT: Float[np.ndarray, "f ch"], share: float = NORMAL_1SD) -> Float64[np.ndarray, " ch"]:
-    """Return the change between consecutive readings that a `share` of all changes of a channel does not exceed.
-
-    By default, this is the standard deviation of the change by noise, because presses change few of the readings.
-    """
-    return np.asarray(np.quantile(np.abs(np.diff(b_uT.astype(np.float64), axis=0)), share, axis=0))
-
-
 def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark the readings of a stream or a log that jump away from the readings before and after them, which agree.
+    """Mark the readings of a stream or a log that are far from the median of the readings around them.
 
-    Such readings come from lines whose digits were cut. In a single reading, any channels may jump, because no press is
-    that short. In up to `JUMP_READINGS_MAX_N` successive readings, exactly one channel of the board may jump, because a
-    press changes several channels. The first and the last reading are compared with their next two.
+    Such readings come from lines whose digits were cut. In a single reading, any channels may be far from their median,
+    because no press is that short. In up to `JUMP_WINDOW_N // 2` successive readings, exactly one channel of a board of
+    several chips may be, because a press changes several channels.
     """
     jumps = np.zeros(len(b_uT), bool)
     if len(b_uT) < JUMP_READINGS_MIN_N:
         return jumps
     b_uT = b_uT.astype(np.float64)
-    usual_uT = step_noise_uT(b_uT, 0.5)
+    step_uT = np.abs(np.diff(b_uT, axis=0))
+    usual_uT = np.median(step_uT, axis=0)
     far_uT = np.maximum(JUMP_MIN_uT, JUMP_STEPS * usual_uT)
-    near_uT = np.maximum(JUMP_NEAR_STEPS * usual_uT, JUMP_MIN_uT * JUMP_NEAR)
-    padded = np.concatenate([b_uT[2:3], b_uT, b_uT[-3:-2]])
-    for jumps_n in range(1, JUMP_READINGS_MAX_N + 1):
-        before, after = padded[: -jumps_n - 1], padded[jumps_n + 1 :]
-        return_uT = np.abs(after - before)
-        settled = (return_uT <= near_uT).all(axis=1)
-        is_jump = np.ones(len(before), bool)
-        for i in range(1, jumps_n + 1):
-            here = padded[i : len(padded) - jumps_n - 1 + i]
-            least_uT = np.minimum(np.abs(here - before), np.abs(here - after))
-            far = least_uT > far_uT
-            alone = settled & (far.sum(axis=1) == 1) & ((least_uT > near_uT).sum(axis=1) == 1)
-            single = (far & (return_uT <= JUMP_AGREE * least_uT)).any(axis=1) if jumps_n == 1 else alone
-            is_jump &= single | alone
-        for i in range(jumps_n):
-            jumps[i : i + len(is_jump)] |= is_jump[: len(jumps) - i]
-    return jumps
+    near_uT = np.maximum(JUMP_NEAR * JUMP_MIN_uT, JUMP_NEAR_STEPS * usual_uT)
+    stepped = np.flatnonzero((step_uT > far_uT).any(axis=1))
+    rows = np.unique(np.concatenate([stepped + i for i in range(-1, 3)])).clip(0, len(b_uT) - 1)
+    around = np.arange(JUMP_WINDOW_N) - JUMP_WINDOW_N // 2
+    off_uT = np.zeros_like(b_uT)
+    windows = np.abs(rows[:, None] + around)  # reflected at both ends
+    windows = len(b_uT) - 1 - np.abs(len(b_uT) - 1 - windows)
+    off_uT[rows] = np.abs(b_uT[rows] - np.median(b_uT[windows], axis=1))
+    far, off = (off_uT > far_uT).sum(axis=1), (off_uT > near_uT).sum(axis=1)
+    beside = np.pad(off, 1)
+    jumps = (far > 0) & (beside[:-2] == 0) & (beside[2:] == 0)
+    return np.asarray(jumps | ((far == 1) & (off == 1) & (b_uT.shape[1] > 3)))
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
