@@ -85,12 +85,14 @@ EXTERNAL = (
 )
 USUAL_COUNTS = {  # counts in the result of `predict` that do not indicate a fault
     "rate_hz", "duration_s", "readings_n", "quiet_start_s", "noise_uT", "contact_readings_n", "contacts_n",
-    "force_max_N", "bytes_n", "frames_n", "frame_bytes_n", "rows_read_n", "rows_n",
+    "force_max_N", "accuracy_pct", "accuracy_registered_pct", "rms_force_N",
+    "bytes_n", "frames_n", "frame_bytes_n", "rows_read_n", "rows_n",
 }  # fmt: skip
 LOG = (
     "A log from an SD card (columns t_s,T0,Bx0,By0,Bz0,T1,... in s, degC and uT), a folder that `reskin record` wrote, "
     "or a file that `reskin decode` wrote."
 )
+LOG_OR_TABLE = f"{LOG[:-1]}; or a table with labels, which is scored."
 
 
 def main() -> None:
@@ -409,24 +411,17 @@ def decode(
     chips_n: Chips = 5,
 ) -> None:
     """Decode raw bytes that were read from a port; write a table with one row per frame, and count the lost bytes."""
-    from reskin import io
     from reskin.board.custom import CustomWire, read_wire
-    from reskin.recordings.decode import decode_dump
-    from reskin.recordings.tables import render_csv
+    from reskin.recordings.decode import decode_file
 
     form = read_wire(wire)
-    chips_n = form.chips_n if isinstance(form, CustomWire) else chips_n
-    table, counts = decode_dump(io.read_bytes(stream), form, chips_n, str(stream))
-    if out.suffix == ".csv":
-        io.write_text(out, render_csv(table))
-    else:
-        io.write_table(out, table)
+    counts = decode_file(stream, out, form, form.chips_n if isinstance(form, CustomWire) else chips_n)
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
 
 
 @app.command(rich_help_panel=RECORDINGS)
 def predict(
-    log: Annotated[Path, Argument(help=LOG)],
+    log: Annotated[Path, Argument(help=LOG_OR_TABLE)],
     out: Annotated[Path, Option(help="The CSV file to write, with columns t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[list[Path] | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
@@ -457,12 +452,23 @@ def _describe_log(counts: Mapping[str, Any]) -> str:
 
     Counts that are 0 are omitted.
     """
+    if "accuracy_pct" in counts:
+        place, shifted = counts["accuracy_pct"], counts["accuracy_registered_pct"]
+        described = f"{counts['readings_n']} readings with labels, {place:.0f} % within 1 mm in x and y"
+        described += f" ({shifted:.0f} % if all places are shifted by the mean error)"
+        if "rms_force_N" in counts:
+            described += f", RMS error of the force {counts['rms_force_N']:.2f} N"
+        return _with_faults(described, counts)
     described = (
         f"{counts['readings_n']} readings in {counts['duration_s']:.1f} s ({counts['rate_hz']:.1f} Hz), "
         f"{counts['contacts_n']} contacts in {counts['contact_readings_n']} of them"
     )
     if "force_max_N" in counts:
         described += f", up to {counts['force_max_N']:.2f} N"
+    return _with_faults(described, counts)
+
+
+def _with_faults(described: str, counts: Mapping[str, Any]) -> str:
     faults = {key: n for key, n in counts.items() if key not in USUAL_COUNTS and not isinstance(n, list) and n}
     return "; ".join([described, *(f"{key} {n:.6g}" for key, n in faults.items())])
 

@@ -29,6 +29,7 @@ from reskin.numerics import signature
 from reskin.schema import INGEST_AGAIN, Readings, arrow_schema, from_table, to_table
 
 PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file
+TABLE_BYTES_MAX_N = 6 * 10**9  # a Parquet file of a few kB may expand to any size
 COUNTS_KEY = b"reskin.account"  # key of the ingestion counts in the metadata of a Parquet file of readings
 DIGEST = "digest"  # key of the digest in the metadata of a safetensors file
 HEADER_AT = 8  # position of the header in a safetensors file; the bytes before it contain the length of the header
@@ -132,6 +133,17 @@ def sync(*paths: Path) -> None:
 def sha256(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def read_blocks(path: Path, bytes_n: int) -> Iterator[bytes]:
+    """Read a file in blocks of `bytes_n` bytes; raise `SchemaError` if it cannot be read."""
+    _check_is_file(path)
+    try:
+        with path.open("rb") as stream:
+            while block := stream.read(bytes_n):
+                yield block
+    except OSError as error:
+        raise SchemaError(f"{path}: cannot read the file: {error.strerror}. Check the path.") from None
 
 
 def read_bytes(path: Path) -> bytes:
@@ -257,8 +269,23 @@ def is_parquet(path: Path) -> bool:
 
 
 def read_table(path: Path) -> pa.Table:
+    """Read a whole table; raise `SchemaError` if its values need more than `TABLE_BYTES_MAX_N` of memory."""
     with _parquet(path) as file:
+        bytes_n = 8 * file.metadata.num_rows * file.metadata.num_columns
+        if bytes_n > TABLE_BYTES_MAX_N:
+            raise SchemaError(
+                f"{path}: the table has {file.metadata.num_rows} rows and {file.metadata.num_columns} columns, which "
+                f"need {bytes_n / 1e9:.1f} GB of memory. Tables of at most {TABLE_BYTES_MAX_N / 1e9:.0f} GB can be "
+                "read at once. Divide the table."
+            )
         return file.read()
+
+
+def read_batches(path: Path, rows_n: int) -> Iterator[pa.Table]:
+    """Read a table in parts of at most `rows_n` rows, of which only one is in memory at a time."""
+    with _parquet(path) as file:
+        for batch in file.iter_batches(rows_n):
+            yield pa.Table.from_batches([batch])
 
 
 def read_column_names(path: Path) -> list[str]:

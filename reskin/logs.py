@@ -73,13 +73,29 @@ def estimate_after(
     find_suppressor: FindSuppressor | None = None,
 ) -> LogEstimates:  # fmt: skip
     """Estimate as `estimate` does, but with a given quiet start, which consists of the first `quiet_n` readings."""
-    noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
-    db_uT = (b_uT - noload_uT).astype(np.float32)
-    quiet_noise_uT = noise_uT(db_uT[:quiet_n])
-    suppressor = None if find_suppressor is None else find_suppressor(quiet_noise_uT)
-    contact = magnitudes_uT(db_uT, suppressor) > contact_threshold_uT(db_uT[:quiet_n], suppressor)
+    detector = ContactDetector(b_uT[:quiet_n], find_suppressor)
+    db_uT = detector.change_uT(b_uT)
     targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
-    return LogEstimates(t_s, targets, contact, quiet_n, quiet_noise_uT)
+    return LogEstimates(t_s, targets, detector.contact(db_uT), quiet_n, detector.noise_uT)
+
+
+class ContactDetector:
+    """A detector of contacts in a log, from the readings `quiet_uT` of its quiet start."""
+
+    def __init__(self, quiet_uT: Float32[np.ndarray, "q ch"], find_suppressor: FindSuppressor | None = None) -> None:
+        self._noload_uT = quiet_uT.mean(axis=0, dtype=np.float64)
+        db_uT = self.change_uT(quiet_uT)
+        self.noise_uT = noise_uT(db_uT)
+        self._suppressor = None if find_suppressor is None else find_suppressor(self.noise_uT)
+        self._threshold_uT = contact_threshold_uT(db_uT, self._suppressor)
+
+    def change_uT(self, b_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
+        """Return the field changes since the quiet start."""
+        return (b_uT - self._noload_uT).astype(np.float32)
+
+    def contact(self, db_uT: Float32[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
+        """Return whether each reading is in contact, from its field changes."""
+        return np.asarray(magnitudes_uT(db_uT, self._suppressor) > self._threshold_uT)
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
@@ -140,20 +156,53 @@ def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
     return int((np.diff(edges)[::2] > 1).sum())
 
 
-def describe(log: LogEstimates) -> dict[str, Any]:
-    """Summarise a log: duration, rate, noise, number of contacts, and the largest estimated force in contact.
+class LogSummary:
+    """The summary of a log: duration, rate, noise, number of contacts, and the largest estimated force in contact.
 
-    With several models, the largest force is averaged over the models.
+    The log may be passed in parts of any length. With several models, the largest force is averaged over the models.
     """
-    return {
-        "rate_hz": 1 / step_s(log.t_s),
-        "duration_s": float(log.t_s[-1] - log.t_s[0] + step_s(log.t_s)),
-        "readings_n": len(log.t_s),
-        "quiet_start_s": log.quiet_n * step_s(log.t_s),
-        "noise_uT": log.noise_uT,
-        "contact_readings_n": int(log.contact.sum()),
-        "contacts_n": contacts_n(log.contact),
-    } | ({"force_max_N": float(log.targets[:, log.contact, 2].max(axis=1).mean())} if log.contact.any() else {})
+
+    def __init__(self, step_s: float, quiet_n: int, noise_uT: float) -> None:
+        self._step_s, self._first_s, self._last_s = step_s, np.nan, np.nan
+        self._counts: dict[str, Any] = {
+            "rate_hz": 1 / step_s, "duration_s": 0.0, "readings_n": 0, "quiet_start_s": quiet_n * step_s,
+            "noise_uT": noise_uT, "contact_readings_n": 0, "contacts_n": 0,
+        }  # fmt: skip
+        self._pending = np.zeros(0, bool)
+        self._force_N: list[Float64[np.ndarray, " m"]] = []  # the largest force so far by each model
+
+    def feed(
+        self, t_s: Float64[np.ndarray, " f"], contact: Bool[np.ndarray, " f"], force_N: Float[np.ndarray, "m c"]
+    ) -> None:
+        """Process the next readings; `force_N` has the estimated forces of those in contact."""
+        if not len(t_s):
+            return
+        self._first_s, self._last_s = float(np.fmin(self._first_s, t_s[0])), float(t_s[-1])
+        self._counts["readings_n"] += len(t_s)
+        self._counts["contact_readings_n"] += int(contact.sum())
+        if contact.any():
+            self._force_N = [np.max([*self._force_N, force_N.max(axis=1)], axis=0)]
+        # Two readings without contact end a contact. What follows the last two may go on in the next part.
+        pending = np.concatenate([self._pending, contact])
+        apart = np.flatnonzero(~pending[:-1] & ~pending[1:])
+        ended_n = int(apart[-1]) + 1 if len(apart) else 0
+        self._counts["contacts_n"] += contacts_n(pending[:ended_n])
+        pending = pending[ended_n:]
+        self._pending = pending if len(pending) <= 4 else np.concatenate([[True, True], pending[-2:]])
+
+    def counts(self) -> dict[str, Any]:
+        """Return the summary of all readings so far."""
+        last_n = contacts_n(self._pending)
+        duration_s = self._last_s - self._first_s + self._step_s
+        counts = self._counts | {"duration_s": duration_s, "contacts_n": self._counts["contacts_n"] + last_n}
+        return counts | ({"force_max_N": float(self._force_N[0].mean())} if self._force_N else {})
+
+
+def describe(log: LogEstimates) -> dict[str, Any]:
+    """Summarise a log (see `LogSummary`)."""
+    summary = LogSummary(step_s(log.t_s), log.quiet_n, log.noise_uT)
+    summary.feed(log.t_s, log.contact, log.targets[:, log.contact, 2])
+    return summary.counts()
 
 
 def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:

@@ -5,25 +5,29 @@ of the log, because only the number of channels is checked.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float32
+from jaxtyping import Bool, Float, Float32, Float64
 
 from reskin import io
 from reskin.errors import ParamsError, SchemaError
-from reskin.logs import Estimator, LogEstimates, describe, estimate, quiet_start
+from reskin.logs import ContactDetector, LogSummary, quiet_start, step_s
+from reskin.metrics import register, score
 from reskin.models.trained import SUFFIX, Network, read_network
 from reskin.recordings import tables
-from reskin.recordings.loading import read_any_log
+from reskin.recordings.loading import READ, kind_of, read_log_blocks
+from reskin.schema import Readings
 from reskin.universal.calibration import is_skin
 from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
 # The model can estimate only forces in a certain range. An estimated force is said to be at a limit of this range if it
 # differs from the smallest or the largest force of the range by at most this factor.
 FORCE_LIMIT = 1.05
+COLUMNS = ("t_s", "x_mm", "y_mm", "F_N", "contact")
 
 
 def predict(
@@ -37,12 +41,16 @@ def predict(
     """Estimate the contacts in a log, and write them to a CSV file.
 
     The file has the columns t_s, x_mm, y_mm, F_N and contact, and one row for each frame of the log, except frames with
-    a fault. In rows without contact, x_mm, y_mm and F_N are empty.
+    a fault. In rows without contact, x_mm, y_mm and F_N are empty. A log of any length is read and written in blocks;
+    its no-load reading and its rate are found in its first 2^18 frames.
+
+    If the file is a table of presses with labels, its rows in contact are estimated and scored against the labels.
 
     Parameters
     ----------
     log
-        The folder of a capture, a table that `reskin decode` wrote, or a log that a board wrote to an SD card.
+        The folder of a capture, a table that `reskin decode` wrote, a log that a board wrote to an SD card, or a table
+        with labels (columns phase, x_mm, y_mm, ...; see data/README.md).
     model
         The file of a network, of a universal model, or of a calibration; or a list of the files of a universal model
         and of its calibration. With None, it is the universal model that comes with the library.
@@ -56,9 +64,10 @@ def predict(
     Returns
     -------
     dict
-        A summary of the log (see `reskin.logs.describe`), and counts of dropped frames. For the universal model, there
-        are further entries. Two of them count doubtful readings in contact: those whose misfit is above `MISFIT_MAX`,
-        and those whose force is at a limit of the model's range. The last entry lists the model's warnings.
+        A summary of the log (see `reskin.logs.LogSummary`) or the scores of a table, and counts of dropped frames. For
+        the universal model, there are further entries. Two of them count doubtful readings in contact: those whose
+        misfit is above `MISFIT_MAX`, and those whose force is at a limit of the model's range. The last entry lists the
+        model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT)
@@ -67,55 +76,99 @@ def predict(
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
     if out.resolve() in {file.resolve() for file in inputs}:
         raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
-    t_s, b_uT, _, counts = read_any_log(log, rate_hz)
+    if log.is_file() and (kind := kind_of(log)) != "log":
+        return _predict_table(*READ[kind](log), models, log, out)
+    account: dict[str, int] = {}
+    blocks = read_log_blocks(log, rate_hz, account)
+    head = next(blocks)
+    _check_channels(head.b_uT, models, log)
+    quiet_n = quiet_start(head.device_s, head.b_uT, where=str(log))
+    quiet_uT = head.b_uT[:quiet_n]
+    if isinstance(models, Universal):
+        models.zero(quiet_uT, keep=True)
+    detector = ContactDetector(quiet_uT, models.suppressor if isinstance(models, Universal) else None)
+    summary = LogSummary(step_s(head.device_s), quiet_n, detector.noise_uT)
+    suspects = _Suspects(models) if isinstance(models, Universal) else None
+    with io.replacing(out) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        for block in chain([head], blocks):
+            db_uT = detector.change_uT(block.b_uT)
+            contact = detector.contact(db_uT)
+            targets = _targets(models, db_uT[contact])
+            if suspects is not None:
+                suspects.feed(db_uT[contact], targets[:, 2])
+            summary.feed(block.device_s, contact, targets[None, :, 2])
+            file.write(render(block.device_s, contact, targets))
+    return summary.counts() | ({} if suspects is None else suspects.counts()) | account
+
+
+def _check_channels(b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Network] | Universal, log: Path) -> None:
     channels_n = models.channels_n if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         raise SchemaError(
             f"{log}: the log has {b_uT.shape[1]} channels, but the model has {channels_n}. Use a model for this board."
         )
-    estimators: Sequence[Estimator]
+
+
+def _targets(models: Sequence[Network] | Universal, db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f 3"]:
+    if not len(db_uT):
+        return np.zeros((0, 3))
+    if not isinstance(models, Universal):
+        return np.asarray(models[0](db_uT), np.float64)
+    found = models.estimate(db_uT + models.noload_uT)
+    return np.column_stack([found.place_mm, found.force_N]).astype(np.float32).astype(np.float64)
+
+
+def _predict_table(
+    readings: Readings, counts: Mapping[str, int], models: Sequence[Network] | Universal, table: Path, out: Path
+) -> dict[str, Any]:
+    """Estimate the readings in contact of a table of presses, and score them against its labels."""
+    _check_channels(readings.b_uT, models, table)
+    db_uT = readings.b_uT - readings.noload_uT
     if isinstance(models, Universal):
-        models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)
-        estimators = [universal := _UniversalOfLog(models)]
-        find_suppressor = models.suppressor
-    else:
-        estimators, universal, find_suppressor = models, None, None
-    estimates = estimate(t_s, b_uT, estimators, where=str(log), find_suppressor=find_suppressor)
-    io.write_text(out, render(estimates))
-    return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | counts
+        models.zero(readings.noload_uT, keep=True)
+    targets = _targets(models, db_uT)
+    io.write_text(out, ",".join(COLUMNS) + "\n" + render(readings.t_s, np.ones(len(readings), bool), targets))
+    true = np.column_stack([readings.x_mm, readings.y_mm, readings.Fz_N]).astype(np.float64)
+    scores = score(true, targets)
+    return {
+        "readings_n": len(readings),
+        "accuracy_pct": scores["accuracy_pct"],
+        "accuracy_registered_pct": score(true, register(true, targets))["accuracy_pct"],
+        **({"rms_force_N": float(np.sqrt(scores["mse_f_N2"]))} if "mse_f_N2" in scores else {}),
+        **({"model_warnings": models.warnings} if isinstance(models, Universal) else {}),
+        **counts,
+    }
 
 
-class _UniversalOfLog:
-    """Adapter with which the universal model can be used as an `Estimator`. It stores the misfit of each reading."""
+class _Suspects:
+    """Counts of readings in contact whose estimates are doubtful, and the warnings of the model.
+
+    These are the readings whose misfit is above `MISFIT_MAX`, and the readings whose estimated force is at a limit of
+    the model's range.
+    """
 
     def __init__(self, model: Universal) -> None:
         self._model = model
-        self._misfit = np.empty(0)
+        self._unknown_n = self._at_limit_n = 0
 
-    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        b_uT = db_uT + self._model.noload_uT
-        result, self._misfit = self._model.estimate(b_uT), self._model.misfit(b_uT)
-        return np.column_stack([result.place_mm, result.force_N]).astype(np.float32)
-
-    def count_suspects(self, estimates: LogEstimates) -> dict[str, Any]:
-        """Count the readings in contact whose estimates are doubtful.
-
-        These are the readings whose misfit is above `MISFIT_MAX`, and the readings whose estimated force is at a limit
-        of the model's range. The result also contains the warnings of the model.
-        """
-        force_N = estimates.targets[0, estimates.contact, 2]
+    def feed(self, db_uT: Float32[np.ndarray, "c ch"], force_N: Float[np.ndarray, " c"]) -> None:
+        if len(db_uT):
+            self._unknown_n += int((self._model.misfit(db_uT + self._model.noload_uT) > MISFIT_MAX).sum())
         lowest_N, highest_N = self._model.layout.force_N
-        at_limit = (force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)
+        self._at_limit_n += int(((force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)).sum())
+
+    def counts(self) -> dict[str, Any]:
         return {
-            "unknown_skin_readings_n": int((self._misfit[estimates.contact] > MISFIT_MAX).sum()),
-            "force_at_limit_readings_n": int(at_limit.sum()),
+            "unknown_skin_readings_n": self._unknown_n,
+            "force_at_limit_readings_n": self._at_limit_n,
             "model_warnings": self._model.warnings,
         }
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
     """Return warnings for the user if the counts that `predict` returned show that some estimates are doubtful."""
-    sentences, contact_n = list(counts.get("model_warnings", [])), counts["contact_readings_n"]
+    sentences, contact_n = list(counts.get("model_warnings", [])), counts.get("contact_readings_n")
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
             f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {contact_n} readings in contact. "
@@ -163,15 +216,14 @@ def _is_calibration(file: Path) -> bool:
         return False  # The error is reported later, by `read_network`.
 
 
-def render(estimates: LogEstimates) -> str:
-    """Return the estimates of a single model as the text of a CSV file.
+def render(t_s: Float64[np.ndarray, " f"], contact: Bool[np.ndarray, " f"], targets: Float64[np.ndarray, "c 3"]) -> str:
+    """Return the estimates of the readings in contact as lines of a CSV file with the columns `COLUMNS`.
 
     Places and forces have three decimals. They are empty in rows without contact.
     """
-    (target,) = estimates.targets
-    target = np.where(estimates.contact[:, None], np.round(target, 3), np.nan)
-    fields = dict(zip(("x_mm", "y_mm", "F_N"), target.T, strict=True))
-    table = {"t_s": pa.array(np.round(estimates.t_s, 4))}
+    values = np.full((len(contact), 3), np.nan)
+    values[contact] = np.round(targets, 3)
     # `from_pandas` converts NaN to null, which is an empty field in CSV.
-    table |= {name: pa.array(values, from_pandas=True) for name, values in fields.items()}
-    return tables.render_csv(pa.table(table | {"contact": pa.array(estimates.contact.astype(np.int8))}))
+    columns = [pa.array(column, from_pandas=True) for column in (np.round(t_s, 4), *values.T)]
+    table = pa.table(dict(zip(COLUMNS, [*columns, pa.array(contact.astype(np.int8))], strict=True)))
+    return tables.render_csv(table).partition("\n")[2]

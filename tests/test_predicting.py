@@ -1,6 +1,7 @@
 """Tests of `reskin predict`, with a network whose output is constant."""
 
 import json
+import re
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +14,7 @@ from reskin.models.network import draw_weights, paper_layers
 from reskin.predicting import predict, warnings
 from reskin.recordings import clocks
 from reskin.recordings.clocks import Arrivals
-from reskin.recordings.decode import decode_dump
+from reskin.recordings.decode import decode_file
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import read_log, render
 from reskin.seeds import rng_for
@@ -73,7 +74,7 @@ def write_stream(folder, wire):
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt"])
 def test_predictions_from_a_stream_from_its_decoded_table_and_from_a_log_are_equal(tmp_path, model, wire):
     folder, table = write_stream(tmp_path, wire), tmp_path / "frames.parquet"
-    io.write_table(table, decode_dump((folder / STREAM_FILE).read_bytes(), wire, 5, "stream")[0])
+    decode_file(folder / STREAM_FILE, table, wire, 5)
     outs = [tmp_path / f"{name}.csv" for name in ("log_out", "folder_out", "table_out")]
     for source, out in zip((write_log(tmp_path), folder, table), outs, strict=True):
         counts = predict(source, model, out, rate_hz=RATE_HZ)
@@ -237,6 +238,24 @@ def test_several_networks_are_refused_for_one_log(tmp_path, model):
         predict(write_log(tmp_path), [model, model], tmp_path / "out.csv")
     same = predict(write_log(tmp_path), FILE, tmp_path / "out.csv")  # This is the shipped model, named explicitly.
     assert same == predict(write_log(tmp_path), None, tmp_path / "out.csv")
+
+
+def test_table_with_labels_is_scored_against_them(tmp_path, capsys):
+    places = np.column_stack([rng_for(0, "places").uniform(3, 13, (40, 2)), np.full(40, 1.0)])
+    noload_uT, b_uT, force_N = simulate_pokes(draw_skin(seed=3), places, seed=3)
+    channels = ",".join(f"B{axis}{chip}" for chip in range(5) for axis in "xyz")
+    lines = [f"phase,x_mm,y_mm,{channels},Fz_N"]
+    for (x_mm, y_mm, _), rest_uT, pressed_uT, f_N in zip(places, noload_uT, b_uT, force_N, strict=False):
+        for phase, row_uT, newton in (("noload", rest_uT, 0.0), ("contact", pressed_uT, f_N)):
+            lines.append(f"{phase},{x_mm:.3f},{y_mm:.3f},{','.join(f'{v:.3f}' for v in row_uT)},{newton:.3f}")
+    (tmp_path / "table.csv").write_text("\n".join(lines) + "\n")
+    cli.predict(tmp_path / "table.csv", tmp_path / "out.csv", None)
+    assert re.search(r"40 readings with labels, \d+ % within 1 mm .*RMS error of the force", capsys.readouterr().out)
+    estimates = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    near = (np.abs(np.column_stack([estimates["x_mm"], estimates["y_mm"]]) - places[:, :2]) <= 1).all(axis=1)
+    counts = predict(tmp_path / "table.csv", None, tmp_path / "out.csv")
+    assert counts["accuracy_pct"] == pytest.approx(100 * near.mean(), abs=5)  # places are rounded in the file
+    assert counts["rms_force_N"] == pytest.approx(np.sqrt(np.mean((estimates["F_N"] - force_N) ** 2)), abs=0.01)
 
 
 def test_log_that_starts_in_contact_is_an_error(tmp_path, model):

@@ -109,8 +109,8 @@ def decode_all(data: bytes, wire: AnyWire, chips_n: int, where: str) -> tuple[Fr
     return frames, stream.account()
 
 
-def no_frame(where: str, data: bytes, wire: AnyWire, chips_n: int) -> CaptureError:
-    """Return the error for a stream without frames.
+def no_frame(where: str, data: bytes, wire: AnyWire, chips_n: int, bytes_n: int | None = None) -> CaptureError:
+    """Return the error for a stream of `bytes_n` bytes (by default, those of `data`) without frames.
 
     The message suggests those formats in which `data`, the first bytes of the stream, can be decoded. If there is none,
     it describes the bytes.
@@ -122,9 +122,8 @@ def no_frame(where: str, data: bytes, wire: AnyWire, chips_n: int) -> CaptureErr
         remedy = f"Check the baud rate, the number of chips and the wire format. The bytes fit {hint}."
     else:
         remedy = f"The bytes are {describe_unknown(data)}"
-    return CaptureError(
-        f"{where}: no frame found in {len(data)} bytes, read as {chips_n} chips in wire format {wire}. {remedy}"
-    )
+    found = f"no frame found in {bytes_n or len(data)} bytes, read as {chips_n} chips in wire format {wire}"
+    return CaptureError(f"{where}: {found}. {remedy}")
 
 
 def matching_formats(data: bytes) -> list[tuple[Wire, int]]:

@@ -1,61 +1,131 @@
-"""Decode a serial dump (the bytes that a port sent) to a table with one row per frame, and read such a table."""
+"""Decode a serial dump (the bytes that a port sent) to a table with one row per frame, and read such a table.
+
+Both work block by block, so that a dump may be longer than the memory.
+"""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
 from jaxtyping import Float32, Float64
 
+from reskin import io
 from reskin.board.custom import AnyWire
-from reskin.board.stream import decode_all
-from reskin.board.wire import record_type
+from reskin.board.stream import FrameStream, no_frame
+from reskin.board.wire import Frames, record_type
 from reskin.errors import CaptureError
 from reskin.recordings import clocks
 
+BLOCK_BYTES_N = 2**24  # bytes of a dump that are decoded at once; they become one row group of a Parquet file
+BLOCK_ROWS_N = 2**16  # rows of a table that are read at once
 
-def decode_dump(data: bytes, wire: AnyWire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
-    """Decode a serial dump to a table, and count its bytes and frames; raise `CaptureError` if it has no frames.
 
-    The unit of each column is in the metadata of its Arrow field.
+def decode_file(dump: Path, out: Path, wire: AnyWire, chips_n: int) -> dict[str, int]:
+    """Decode a serial dump to a CSV file (if the name of `out` ends in .csv) or a Parquet file.
+
+    Returns the counts of bytes and frames. Raises CaptureError if there are no frames. The unit of each column is in
+    the metadata of its Arrow field.
     """
-    frames, account = decode_all(data, wire, chips_n, where)
-    values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
+    account: dict[str, int] = {}
     fields = [
-        pa.field(name, pa.from_numpy_dtype(column.dtype), metadata={"unit": unit})
-        for (name, unit), column in zip(frame_columns(chips_n).items(), values, strict=True)
+        pa.field(
+            name, pa.float64() if unit == "s" else pa.int64() if unit == "1" else pa.float32(), metadata={"unit": unit}
+        )
+        for name, unit in frame_columns(chips_n).items()
     ]
-    arrays = [pa.array(np.ascontiguousarray(column)) for column in values]
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields)), account
+    schema = pa.schema(fields)
+    with io.replacing(out) as temporary:
+        if out.suffix == ".csv":
+            with temporary.open("wb") as file:
+                file.write(",".join(schema.names).encode() + b"\n")
+                options = pacsv.WriteOptions(include_header=False, quoting_style="none")
+                with pacsv.CSVWriter(file, schema, write_options=options) as writer:
+                    for frames in decode_blocks(io.read_blocks(dump, BLOCK_BYTES_N), wire, chips_n, str(dump), account):
+                        writer.write_table(_table(frames, schema))
+        else:
+            with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
+                for frames in decode_blocks(io.read_blocks(dump, BLOCK_BYTES_N), wire, chips_n, str(dump), account):
+                    writer.write_table(_table(frames, schema))
+    return account
+
+
+def decode_blocks(
+    blocks: Iterable[bytes], wire: AnyWire, chips_n: int, where: str, account: dict[str, int]
+) -> Iterator[Frames]:
+    """Decode the blocks of a stream; at its end, add the counts of bytes and frames to `account`.
+
+    Raises CaptureError if the whole stream contains no frame.
+    """
+    stream, head = FrameStream(wire, chips_n), b""
+    for block in blocks:
+        head = head or block
+        if len(frames := stream.feed(block)):
+            yield frames
+    if len(frames := stream.close()):
+        yield frames
+    counts = stream.account()
+    if not counts["frames_n"]:
+        raise no_frame(where, head, wire, chips_n, bytes_n=counts["bytes_n"])
+    account.update(counts)
+
+
+def _table(frames: Frames, schema: pa.Schema) -> pa.Table:
+    values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
+    return pa.Table.from_arrays([pa.array(np.ascontiguousarray(column)) for column in values], schema=schema)
 
 
 def read_frames(
     table: pa.Table, rate_hz: float, where: str, account: dict[str, int]
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
-    """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
+    """Return time in s, field in uT and temperature in degC of the frames of a decoded dump."""
+    (frames,) = _timed([table], rate_hz, where)
+    return frames.device_s, frames.b_uT, frames.temperature_degC
 
-    If every frame has a time of the board's clock, these times are returned; `account` says if their resolution was too
-    coarse. Otherwise, times are computed from the
-    constant frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream,
-    so that lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
+
+def read_frame_blocks(file: Path, rate_hz: float) -> Iterator[Frames]:
+    """Yield the frames of a decoded dump; `device_s` is their time in s, and `end_byte` the number of their row.
+
+    If the frames have times of the board's clock, these times are used. Otherwise, times are computed from the constant
+    frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream, so that
+    lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
     """
-    chips_n = sum(name.startswith("temperature") for name in table.column_names)
-    if table.column_names != list(frame_columns(chips_n)):
-        names = ", ".join(table.column_names)[:80]
-        raise CaptureError(
-            f"{where}: the columns {names} are not those that `reskin decode` writes. Decode the dump again, with "
-            "`reskin decode`."
-        )
-    values = [np.asarray(column) for column in table.columns]
-    device_s, end_byte = values[-2:]
-    if np.isfinite(device_s).all():
-        clock = clocks.BoardClock()
-        t_s = clock.times_of(device_s, end_byte)
-        account.update(clock.account)
-    else:
-        # Text frames are longer than binary frames. If any frame has the length of a binary frame, the format is
-        # binary.
-        frame_bytes_n = record_type("binary", chips_n).itemsize
-        is_binary = (np.diff(end_byte, prepend=0) == frame_bytes_n).any()
-        t_s = clocks.constant_rate(end_byte / frame_bytes_n if is_binary else 1.0 + np.arange(len(table)), rate_hz)
-    return t_s, np.stack(values[: 3 * chips_n], axis=1), np.stack(values[3 * chips_n : -2], axis=1)
+    return _timed(io.read_batches(file, BLOCK_ROWS_N), rate_hz, str(file))
+
+
+def _timed(tables: Iterable[pa.Table], rate_hz: float, where: str) -> Iterator[Frames]:
+    rows_n, last_byte, has_clock, is_binary = 0, 0, None, None
+    for table in tables:
+        chips_n = sum(name.startswith("temperature") for name in table.column_names)
+        if table.column_names != list(frame_columns(chips_n)):
+            names = ", ".join(table.column_names)[:80]
+            raise CaptureError(
+                f"{where}: the columns {names} are not those that `reskin decode` writes. Decode the dump again, with "
+                "`reskin decode`."
+            )
+        *columns, device_s, end_byte = (np.asarray(column) for column in table.columns)
+        b_uT, temperature_degC = np.stack(columns[: 3 * chips_n], axis=1), np.stack(columns[3 * chips_n :], axis=1)
+        row_n = rows_n + 1 + np.arange(len(table))
+        timed = np.isfinite(device_s)
+        if has_clock is None:
+            has_clock = bool(timed.all())
+            # Text frames are longer than binary frames. If any frame has the length of a binary frame, the format is
+            # binary.
+            is_binary = bool((np.diff(end_byte, prepend=last_byte) == record_type("binary", chips_n).itemsize).any())
+        if has_clock and not timed.all():
+            row = row_n[timed.argmin()]
+            raise CaptureError(
+                f"{where} row {row}: device_s is missing, but earlier rows have it. Decode the dump again."
+            )
+        if has_clock:
+            t_s = device_s.astype(np.float64)
+        else:
+            frame = end_byte / record_type("binary", chips_n).itemsize if is_binary else row_n.astype(np.float64)
+            t_s = clocks.constant_rate(frame, rate_hz)
+        yield Frames(b_uT, temperature_degC, t_s, row_n)
+        rows_n, last_byte = rows_n + len(table), int(end_byte[-1]) if len(table) else last_byte
 
 
 def frame_columns(chips_n: int) -> dict[str, str]:

@@ -4,7 +4,7 @@ A log is a sequence of frames without labels.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reskin import io
-from reskin.board.stream import decode_all
+from reskin.board.wire import Frames, concatenate
 from reskin.errors import CaptureError, ParamsError, ReskinError, missing_package
-from reskin.recordings.decode import frame_columns, read_frames
-from reskin.recordings.fault_policy import STANDARD_POLICY
-from reskin.recordings.header import LOG_FILE, PROBE_FILE, RATE_MAX_HZ, STREAM_FILE, write_capture
+from reskin.recordings.decode import BLOCK_BYTES_N, decode_blocks, frame_columns, read_frame_blocks
+from reskin.recordings.fault_policy import STANDARD_POLICY, check_log
+from reskin.recordings.header import LOG_FILE, PROBE_FILE, RATE_MAX_HZ, STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import open_capture, read_header, timer
 from reskin.recordings.preparing import UNNAMED, CaptureNames, foreign, layouts_of
 from reskin.recordings.readers import READERS, sd_card
@@ -30,39 +30,51 @@ EXTRA = "learn"  # the extra of pyproject.toml that installs pandas
 
 
 def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
-    """Read the frames of a log: a capture folder, a table that `reskin decode` wrote, or the log of an SD card.
+    """Read all frames of a log; see `read_log_blocks`."""
+    account: dict[str, int] = {}
+    parts = list(read_log_blocks(log, rate_hz, account))
+    frames = concatenate(parts, parts[0].temperature_degC.shape[1])
+    return frames.device_s, frames.b_uT, frames.temperature_degC, account
 
-    `rate_hz` is the frame rate of a table that has no times.
+
+def read_log_blocks(log: Path, rate_hz: float, account: dict[str, int]) -> Iterator[Frames]:
+    """Yield the fault-free frames of a log, with their times in `device_s`; at the end, count all in `account`.
+
+    A log is a capture folder, a table that `reskin decode` wrote, or the log of an SD card. `rate_hz` is the frame rate
+    of a table that has no times. The parts are those of `fault_policy.check_log`.
     """
     if log.is_dir():
-        return _read_capture(log)
-    if not 0 < rate_hz <= RATE_MAX_HZ:
+        header = read_header(log)
+        if header.layout != "sd-card":
+            return _read_capture(log, header, account)
+        log /= LOG_FILE
+    elif not 0 < rate_hz <= RATE_MAX_HZ:
         raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} must be above 0 and at most {RATE_MAX_HZ:g}.")
-    if log.is_file():
-        if io.is_parquet(log):
-            account: dict[str, int] = {}
-            *frames, counts = sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log), account), str(log))
-            return *frames, account | counts  # type: ignore[return-value]
-    return sd_card.read_log(log)
+    elif log.is_file() and io.is_parquet(log):
+        return check_log(read_frame_blocks(log, rate_hz), str(log), account)
+    return check_log(sd_card.read_blocks(log, account), str(log), account)
 
 
-def _read_capture(folder: Path) -> sd_card.Log:
+def _read_capture(folder: Path, header: Header, account: dict[str, int]) -> Iterator[Frames]:
     """Read the frames of a capture; drop frames after the last recorded arrival, because their times are unknown."""
-    header = read_header(folder)
-    if header.layout == "sd-card":
-        return sd_card.read_log(folder / LOG_FILE)
     if header.wire is None:
         raise CaptureError(
             f"{folder}: cannot predict from a capture of layout {header.layout}. Use a capture that `reskin record` "
             "wrote, or the log of an SD card."
         )
-    stream = folder / STREAM_FILE
-    frames, decoded = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
-    t_s = timer(folder, header)(frames, 0)
-    timed = np.isfinite(t_s)
-    kept = frames.where(timed)
-    *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
-    return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+    stream, untimed = folder / STREAM_FILE, "dropped_no_time_frames_n"
+    blocks = decode_blocks(io.read_blocks(stream, BLOCK_BYTES_N), header.wire, header.chips_n, str(stream), account)
+
+    def timed() -> Iterator[Frames]:
+        times_of, frames_n, untimed_n = timer(folder, header), 0, 0
+        for frames in blocks:
+            t_s = times_of(frames, frames_n)
+            known, number = np.isfinite(t_s), frames_n + 1 + np.arange(len(frames))
+            yield replace(frames, device_s=t_s, end_byte=number).where(known)
+            frames_n, untimed_n = frames_n + len(frames), untimed_n + int((~known).sum())
+        account[untimed] = untimed_n
+
+    return check_log(timed(), str(stream), account)
 
 
 def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
@@ -101,7 +113,7 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
         kind = "log" if is_log or (frames and header.layout == "native") else "labelled"
         names_of = {name: getattr(header, name) for name in LABELS}
     else:
-        kind = _kind_of(path)
+        kind = kind_of(path)
     if kind != "log":
         if frames:
             raise ParamsError(
@@ -115,7 +127,7 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
     return _frame(pd, {**names_of, "t_s": t_s, **measured}, counts)
 
 
-def _kind_of(file: Path) -> str:
+def kind_of(file: Path) -> str:
     """Return the kind of a file: `table` or `ingested` if it has the column names of this kind, and `log` otherwise."""
     if not file.is_file():
         raise CaptureError(f"{file}: file not found. Check the path.")

@@ -31,6 +31,7 @@ COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or corr
 NUMBER_PATTERN = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 GZIP_MARK = b"\x1f\x8b"
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+CSV_BLOCK_BYTES_N = 2**22  # bytes of a log that are parsed at once
 FIRST_ROW = 2  # the first row with values; row 1 of the file has the column names
 # Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
 CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
@@ -70,37 +71,37 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
     return table.select(list(types)).combine_chunks()
 
 
-def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> Float64[np.ndarray, "f c"]:
-    """Read a CSV file of numbers that a program wrote line by line, some of whose lines may be torn.
+def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> Iterator[Float64[np.ndarray, "f c"]]:
+    """Read a CSV file of numbers in blocks; a program wrote it line by line, and some lines may be torn.
 
     Cells that are empty or are no numbers are NaN, and so are all cells of lines with too few or too many of them.
     Raises CaptureError if the file is not readable text.
     """
-    torn_row = []
-
-    def skip(row: Any) -> str:
-        torn_row.append(row.number - FIRST_ROW)
-        return "skip"
-
-    text = pa.string()
-    try:
-        table = pacsv.read_csv(
-            path,
-            read_options=pacsv.ReadOptions(use_threads=False),
-            parse_options=pacsv.ParseOptions(invalid_row_handler=skip),
-            convert_options=pacsv.ConvertOptions(column_types=dict.fromkeys(names, text)),
-        ).select(list(names))
-    except (pa.ArrowInvalid, UnicodeDecodeError, KeyError) as error:
-        got = ascii(" ".join(str(error).split()))[1:-1][:200]
-        raise CaptureError(f"{where}: not a CSV file with columns {_list(list(names))}: {got}. {COPY_AGAIN}") from None
-    rows_n = len(table) + len(torn_row)
-    whole = ~np.isin(np.arange(rows_n), torn_row)
-    numbers = np.full((rows_n, len(names)), np.nan)
-    for i, name in enumerate(names):
-        cells = pc.utf8_trim_whitespace(table.column(name))
-        is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
-        numbers[whole, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
-    return numbers
+    text, columns_n = pa.string(), len(names)
+    with path.open("rb") as file:
+        file.readline()
+        while block := file.read(CSV_BLOCK_BYTES_N):
+            lines = (block + file.readline()).rstrip(b"\r\n").split(b"\n")
+            # A line with another number of cells becomes a line of empty cells, so that it keeps its place.
+            whole = [line if line.count(b",") == columns_n - 1 else b"," * (columns_n - 1) for line in lines]
+            try:
+                table = pacsv.read_csv(
+                    pa.py_buffer(b"\n".join(whole) + b"\n"),
+                    read_options=pacsv.ReadOptions(use_threads=False, column_names=list(names)),
+                    parse_options=pacsv.ParseOptions(quote_char=False, ignore_empty_lines=False),
+                    convert_options=pacsv.ConvertOptions(column_types=dict.fromkeys(names, text)),
+                )
+            except (pa.ArrowInvalid, UnicodeDecodeError, KeyError) as error:
+                got = ascii(" ".join(str(error).split()))[1:-1][:200]
+                raise CaptureError(
+                    f"{where}: not a CSV file with columns {_list(list(names))}: {got}. {COPY_AGAIN}"
+                ) from None
+            numbers = np.full((len(lines), columns_n), np.nan)
+            for i, name in enumerate(names):
+                cells = pc.utf8_trim_whitespace(table.column(name))
+                is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
+                numbers[:, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
+            yield numbers
 
 
 def _column_names(source: str | Path) -> list[str]:

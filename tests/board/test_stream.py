@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.experiments.extremes.serial import cut_start, decode_portions, lost_frames_n, records
+from reskin import io
 from reskin.board import stream
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
 from reskin.errors import CaptureError
-from reskin.recordings.decode import decode_dump
+from reskin.recordings.decode import decode_file
 from tests.board.signals import BINARY_WIRES, TEXT_WIRES, WIRES, CRLF_TEMPERATURE_degC, frames_strategy, make_frames
 
 EVERY_WIRE = st.sampled_from(WIRES)
@@ -266,9 +267,11 @@ def test_error_has_no_suggestion_if_no_wire_format_fits():
         decode_all(b"\0", "binary", 5, "a.bin")
 
 
-def test_decode_dump_returns_a_table_with_units():
+def test_decoded_file_is_a_table_with_units(tmp_path):
     frames = make_frames(4, 2, seed=0)
-    table, account = decode_dump(encode(frames, "binary"), "binary", 2, "dump.bin")
+    (tmp_path / "dump.bin").write_bytes(encode(frames, "binary"))
+    account = decode_file(tmp_path / "dump.bin", tmp_path / "frames.parquet", "binary", 2)
+    table = io.read_table(tmp_path / "frames.parquet")
     assert account["frames_n"] == len(table) == 4
     np.testing.assert_array_equal(table["by1_uT"].to_numpy(), frames.b_uT[:, 4])
     np.testing.assert_array_equal(table["temperature1_degC"].to_numpy(), frames.temperature_degC[:, 1])
@@ -276,6 +279,8 @@ def test_decode_dump_returns_a_table_with_units():
     assert table["end_byte"].to_pylist() == [34, 68, 102, 136]
 
 
-def test_dumped_stream_without_frames_is_refused():
+def test_dumped_stream_without_frames_is_refused(tmp_path):
+    (tmp_path / "dump.bin").write_bytes(b"abc")
     with pytest.raises(CaptureError, match="no frame found in 3 bytes"):
-        decode_dump(b"abc", "binary", 2, "dump.bin")
+        decode_file(tmp_path / "dump.bin", tmp_path / "frames.parquet", "binary", 2)
+    assert not (tmp_path / "frames.parquet").exists()

@@ -13,7 +13,7 @@ from reskin.board.wire import Frames, encode, record_type
 from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals
-from reskin.recordings.decode import decode_dump
+from reskin.recordings.decode import decode_file
 from reskin.recordings.fault_policy import STANDARD_POLICY
 from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.ingest import open_capture
@@ -74,8 +74,7 @@ def test_load_recording_returns_equal_frames_for_all_kinds_of_logs(tmp_path):
     t_s, b_uT, temperature_degC = frames_of_board()
     folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
     (tmp_path / "log.csv").write_text(sd_card.render(t_s, b_uT, temperature_degC))
-    table, _ = decode_dump((folder / STREAM_FILE).read_bytes(), "binary", CHIPS_N, "stream")
-    io.write_table(tmp_path / "decoded.parquet", table)
+    decode_file(folder / STREAM_FILE, tmp_path / "decoded.parquet", "binary", CHIPS_N)
 
     card = reskin.load_recording(tmp_path / "log.csv")
     decoded = reskin.load_recording(str(tmp_path / "decoded.parquet"), rate_hz=RATE_HZ)

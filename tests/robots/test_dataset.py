@@ -14,7 +14,7 @@ import pytest
 from reskin import io
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
 from reskin.errors import CaptureError, ReskinError, SchemaError
-from reskin.recordings.decode import decode_dump
+from reskin.recordings.decode import decode_file
 from reskin.recordings.header import HEADER_FILE, PROBE_FILE, STREAM_FILE, Clock, write_capture
 from reskin.robots import dataset
 from reskin.robots.dataset import export_lerobot
@@ -163,7 +163,7 @@ def test_each_indentation_of_ingested_readings_becomes_an_episode(tmp_path):
 def test_export_of_readings_without_times_raises_unless_their_rate_is_given(tmp_path):
     file = write_readings(tmp_path / "c.parquet", t_s=np.full(40, np.nan))
     stream = write_stream(tmp_path, "binary") / STREAM_FILE
-    io.write_table(tmp_path / "frames.parquet", decode_dump(stream.read_bytes(), "binary", 5, "stream")[0])
+    decode_file(stream, tmp_path / "frames.parquet", "binary", 5)
     for path in (file, tmp_path / "frames.parquet"):
         with pytest.raises(ReskinError, match="have no times. State their rate"):
             export_lerobot([path], tmp_path / "out", task="touch")

@@ -6,6 +6,7 @@ columns T may be missing; the temperatures are then unknown (NaN).
 """
 
 from codecs import BOM_UTF8
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -52,26 +53,36 @@ def read_log(path: Path) -> Log:
     Temperatures are NaN if the log has none. Torn lines are dropped and counted, and so are the frames that
     `fault_policy.check_log` does not accept.
     """
+    account: dict[str, int] = {}
+    parts = list(check_log(read_blocks(path, account), str(path), account))
+    kept = concatenate(parts, parts[0].temperature_degC.shape[1])
+    return kept.device_s, kept.b_uT, kept.temperature_degC, account
+
+
+def read_blocks(path: Path, account: dict[str, int]) -> Iterator[Frames]:
+    """Yield the whole lines of a log with their times and row numbers; at the end, count the torn lines."""
     where = str(path)
     names = _read_names(path, where)
-    numbers = tables.parse_torn_csv(path, names, where)
-    if not len(numbers):
+    chips_n = sum(name.startswith("Bx") for name in names)
+    lines_n = torn_n = 0
+    for numbers in tables.parse_torn_csv(path, names, where):
+        whole = np.isfinite(numbers).all(axis=1)
+        row_n = FIRST_ROW + lines_n + np.flatnonzero(whole)
+        lines_n, torn_n = lines_n + len(whole), torn_n + int((~whole).sum())
+        chips = numbers[whole, 1:].reshape(len(row_n), chips_n, (len(names) - 1) // chips_n)
+        b_uT = chips[:, :, -3:].reshape(len(chips), 3 * chips_n).astype(np.float32)
+        measured = chips.shape[2] == len(CHIP_COLUMNS)
+        temperature_degC = (chips[:, :, 0] if measured else np.full(chips.shape[:2], np.nan)).astype(np.float32)
+        yield Frames(b_uT, temperature_degC, numbers[whole, 0], row_n)
+    if not lines_n:
         raise CaptureError(f"{where}: the log has no lines below the column names. Copy the log again.")
-    whole = np.isfinite(numbers).all(axis=1)
-    row_n, torn_n = FIRST_ROW + np.flatnonzero(whole), int((~whole).sum())
-    if torn_n > TORN_SHARE_MAX * len(numbers):
+    if torn_n > TORN_SHARE_MAX * lines_n:
         raise CaptureError(
-            f"{where}: {torn_n} of {len(numbers)} lines are torn: cells are missing or are no numbers. Check the "
+            f"{where}: {torn_n} of {lines_n} lines are torn: cells are missing or are no numbers. Check the "
             "program that wrote the log, and log again."
         )
-    numbers = numbers[whole]
-    chips_n = sum(name.startswith("Bx") for name in names)
-    chips = numbers[:, 1:].reshape(len(numbers), chips_n, -1)
-    b_uT = chips[:, :, -3:].reshape(len(chips), -1).astype(np.float32)
-    measured = chips.shape[2] == len(CHIP_COLUMNS)
-    temperature_degC = (chips[:, :, 0] if measured else np.full(chips.shape[:2], np.nan)).astype(np.float32)
-    *log, account = keep_whole(numbers[:, 0], b_uT, temperature_degC, where, row_n)
-    return *log, ({"dropped_torn_lines_n": torn_n} if torn_n else {}) | account  # type: ignore[return-value]
+    if torn_n:
+        account["dropped_torn_lines_n"] = torn_n
 
 
 def keep_whole(
