@@ -27,6 +27,7 @@ from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_u
 # The model can estimate only forces in a certain range. An estimated force is said to be at a limit of this range if it
 # differs from the smallest or the largest force of the range by at most this factor.
 FORCE_LIMIT = 1.05
+ESTIMATED_AT_ONCE_N = 2**15  # number of readings, which limits the memory that a model needs
 COLUMNS = ("t_s", "x_mm", "y_mm", "F_N", "contact")
 
 
@@ -91,7 +92,8 @@ def predict(
     suspects = _Suspects(models) if isinstance(models, Universal) else None
     with io.replacing(out) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(",".join(COLUMNS) + "\n")
-        for block in chain([head], blocks):
+        parts = (part for block in chain([head], blocks) for part in block.divide(ESTIMATED_AT_ONCE_N))
+        for block in parts:
             db_uT = detector.change_uT(block.b_uT)
             contact = detector.contact(db_uT)
             targets = _targets(models, db_uT[contact])

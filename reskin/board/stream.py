@@ -12,6 +12,7 @@ from typing import get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
+from numpy.lib.stride_tricks import sliding_window_view
 
 from reskin.board import wire as wires
 from reskin.board.custom import AnyWire, CustomWire
@@ -263,9 +264,10 @@ def _find_runs(
 
 def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
     """Return how many successive frames, from the first byte on, are accepted directly (see `_find_runs`)."""
-    sure_n, frames_n = 0, len(octets) // record.itemsize
+    sure_n, frames_n, block_n = 0, len(octets) // record.itemsize, 1
     while sure_n < frames_n:
-        block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
+        # The blocks grow, so that little is read in vain if a search begins after every frame.
+        block_n = min(frames_n - sure_n, 8 * block_n, BLOCK_FRAMES_N)
         block = octets[sure_n * record.itemsize : (sure_n + block_n) * record.itemsize]
         sure_in_block_n = _sure_in_block_n(block, record)
         sure_n += sure_in_block_n
@@ -279,12 +281,14 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
     rows = block.reshape(-1, record.itemsize)
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
+    if not closed_n:
+        return 0
     ends = _terminators(block[: closed_n * record.itemsize])
     if np.count_nonzero(ends) == closed_n:  # each CR LF is at the end of a frame
         return closed_n
-    inside = np.flatnonzero(ends)
-    inside = inside[inside % record.itemsize != record.itemsize - 2]
-    suspect_i = np.unique(inside // record.itemsize)
+    inside = np.append(ends, False).reshape(closed_n, record.itemsize)
+    inside[:, -2] = False
+    suspect_i = np.flatnonzero(inside.any(axis=1))
     plausible = _plausible(block.view(record)["txyz"][suspect_i]).all(axis=1)
     return closed_n if plausible.all() else int(suspect_i[plausible.argmin()])
 
@@ -308,10 +312,12 @@ def _search(
     if not final and window_n < first + 3 * length_n:  # other candidate positions may follow
         return max(first - 2, 0), False
     starts = first + np.flatnonzero(fits[first : first + length_n])
-    here_n, next_n = (
-        np.array([_plausible_n(window[start:], record) if fits[start] else 0 for start in starts + shift])
-        for shift in (0, length_n)
-    )
+    candidates = np.concatenate([starts, starts + length_n])
+    whole = candidates[fits[candidates]]
+    plausible_n = np.zeros(len(candidates), np.int64)
+    rows = sliding_window_view(window, length_n)[whole]  # a copy of the bytes of each frame that may begin here
+    plausible_n[fits[candidates]] = _plausible(rows.view(record)["txyz"][:, 0]).sum(axis=1)
+    here_n, next_n = np.split(plausible_n, 2)
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
     # If the values of a frame contain CR LF, the bytes after this CR LF may look like the start of a frame. Such a
@@ -325,17 +331,13 @@ def _terminators(octets: UInt8[np.ndarray, " bytes"]) -> Bool[np.ndarray, " pair
     return (octets[:-1] == CR) & (octets[1:] == LF)
 
 
-def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the chips with plausible values in the frame that begins at the first byte."""
-    return int(np.count_nonzero(_plausible(octets[: record.itemsize].view(record)["txyz"])))
-
-
 def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
     """Mark the chips whose values are possible for the magnetometer."""
     temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
     possible_temperature = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
-    not_tiny = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
-    return possible_temperature & not_tiny & (np.abs(b_uT) <= B_MAX_uT).all(axis=-1)
+    possible_value = (txyz == 0) | (np.abs(txyz) >= VALUE_MIN)
+    possible_value[..., 1:] &= np.abs(b_uT) <= B_MAX_uT
+    return possible_temperature & possible_value.all(axis=-1)
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:

@@ -45,6 +45,11 @@ class Frames:
         """Return the frames that `rows` marks."""
         return Frames(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    def divide(self, frames_n: int) -> Iterator["Frames"]:
+        """Yield the frames in parts of at most `frames_n` frames."""
+        for first in range(0, len(self), frames_n):
+            yield self.where(slice(first, first + frames_n))
+
 
 def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
     """Join frames in order; if there are no parts, return an object with zero frames of `chips_n` chips."""

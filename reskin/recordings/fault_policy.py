@@ -394,24 +394,26 @@ def check_log(blocks: Iterable[Frames], where: str, account: dict[str, int]) -> 
         ("gaps_n", "gap_frames_n", "rows_read_n", "dropped_failed_read_rows_n", "dropped_stuck_chip_rows_n", "rows_n"),
         0,
     )
-    for part in chain([head], parts):
-        t_s = part.device_s
-        _check_order(last_s, part, where)
-        steps = np.diff(t_s, prepend=last_s) / step_s
-        last_s, first_n = float(t_s[-1]), counts["rows_read_n"]
-        numbers = first_n + 1 + np.arange(len(part))
-        numbered = replace(part, device_s=np.full(len(part), np.nan), end_byte=numbers)
-        checked = log.apply(detector.feed(numbered, t_s), t_s)
-        found = {
-            "gaps_n": int((steps > GAP_FRAMES).sum()),
-            "gap_frames_n": int((np.round(steps[steps > GAP_FRAMES]) - 1).sum()),
-            "rows_read_n": len(part),
-            "dropped_failed_read_rows_n": int(checked.failed.sum()),
-            "dropped_stuck_chip_rows_n": int(checked.stuck.sum()),
-            "rows_n": int(checked.keep.sum()),
-        }
-        counts = {name: n + found[name] for name, n in counts.items()}
-        kept = part.where(checked.keep)
+    for block in chain([head], parts):
+        first_n = counts["rows_read_n"]
+        checked_parts = []
+        for part in block.divide(LOG_BLOCK_FRAMES_N):
+            t_s, unknown = part.device_s, np.full(len(part), np.nan)
+            _check_order(last_s, part, where)
+            steps = np.diff(t_s, prepend=last_s) / step_s
+            number = counts["rows_read_n"] + 1 + np.arange(len(part))
+            checked = log.apply(detector.feed(replace(part, device_s=unknown, end_byte=number), t_s), t_s)
+            found = {
+                "gaps_n": int((steps > GAP_FRAMES).sum()),
+                "gap_frames_n": int((np.round(steps[steps > GAP_FRAMES]) - 1).sum()),
+                "rows_read_n": len(part),
+                "dropped_failed_read_rows_n": int(checked.failed.sum()),
+                "dropped_stuck_chip_rows_n": int(checked.stuck.sum()),
+                "rows_n": int(checked.keep.sum()),
+            }
+            counts, last_s = {name: n + found[name] for name, n in counts.items()}, float(t_s[-1])
+            checked_parts.append(part.where(checked.keep))
+        kept = concatenate(checked_parts, 0)
         if not first_n:
             _check_kept(counts, where)
             check_fields(kept.b_uT, where, line_n=kept.end_byte)
