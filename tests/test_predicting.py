@@ -5,16 +5,17 @@ import re
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
-from reskin import cli, draw_skin, io, load_model, load_universal, simulate_pokes
+from reskin import cli, draw_skin, io, load_model, load_universal, predicting, simulate_pokes
 from reskin.board.wire import Frames, encode, record_type
 from reskin.errors import CaptureError, ReskinError
 from reskin.models.network import draw_weights, paper_layers
 from reskin.predicting import predict, warnings
-from reskin.recordings import clocks
+from reskin.recordings import clocks, fault_policy, tables
 from reskin.recordings.clocks import Arrivals
-from reskin.recordings.decode import decode_file
+from reskin.recordings.decode import decode_file, frame_columns
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import read_log, render
 from reskin.seeds import rng_for
@@ -256,6 +257,35 @@ def test_table_with_labels_is_scored_against_them(tmp_path, capsys):
     counts = predict(tmp_path / "table.csv", None, tmp_path / "out.csv")
     assert counts["accuracy_pct"] == pytest.approx(100 * near.mean(), abs=5)  # places are rounded in the file
     assert counts["rms_force_N"] == pytest.approx(np.sqrt(np.mean((estimates["F_N"] - force_N) ** 2)), abs=0.01)
+
+
+@pytest.mark.parametrize("rows_n", [37, 128, 10_000])
+def test_predictions_do_not_depend_on_the_sizes_of_blocks(tmp_path, monkeypatch, rows_n):
+    """The log has presses, failed reads, a stuck chip and cut numbers, which cross the edges of the blocks."""
+    t_s, b_uT, temperature_degC = log_of()
+    t_s, b_uT = (1 + np.arange(4 * len(t_s))) / RATE_HZ, np.tile(b_uT, (4, 1))
+    b_uT[900:1000, 6:9] = b_uT[900, 6:9]
+    b_uT[100::61, 3:6], b_uT[130::53, 8] = 0.0, 12.0
+    (tmp_path / "log.csv").write_text(render(t_s, b_uT, np.tile(temperature_degC, (4, 1))))
+    monkeypatch.setattr(fault_policy, "LOG_HEAD_FRAMES_N", 640)
+    monkeypatch.setattr(fault_policy, "LOG_BLOCK_FRAMES_N", 320)
+    expected = predict(tmp_path / "log.csv", None, tmp_path / "expected.csv")
+    assert expected["contacts_n"] == 4
+    assert min(expected[f"dropped_{name}_rows_n"] for name in ("failed_read", "stuck_chip")) > 20
+    monkeypatch.setattr(tables, "CSV_BLOCK_BYTES_N", 100 * rows_n)
+    monkeypatch.setattr(predicting, "ESTIMATED_AT_ONCE_N", rows_n)
+    assert predict(tmp_path / "log.csv", None, tmp_path / "out.csv") == expected
+    assert (tmp_path / "out.csv").read_text() == (tmp_path / "expected.csv").read_text()
+
+
+def test_table_that_would_expand_beyond_the_memory_is_refused_or_read_in_parts(tmp_path, monkeypatch):
+    monkeypatch.setattr(io, "TABLE_BYTES_MAX_N", 10**7)
+    table = pa.table({name: np.zeros(2**16) for name in frame_columns(5)})
+    pq.write_table(table, tmp_path / "x.parquet", compression="zstd")
+    with pytest.raises(ReskinError, match="rows .* GB of memory"):
+        io.read_table(tmp_path / "x.parquet")
+    with pytest.raises(CaptureError, match="I2C read of a chip failed"):  # found in the first block
+        predict(tmp_path / "x.parquet", None, tmp_path / "out.csv")
 
 
 def test_log_that_starts_in_contact_is_an_error(tmp_path, model):

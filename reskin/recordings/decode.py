@@ -106,7 +106,11 @@ def _timed(tables: Iterable[pa.Table], rate_hz: float, where: str) -> Iterator[F
                 "`reskin decode`."
             )
         *columns, device_s, end_byte = (np.asarray(column) for column in table.columns)
-        b_uT, temperature_degC = np.stack(columns[: 3 * chips_n], axis=1), np.stack(columns[3 * chips_n :], axis=1)
+        b_uT, temperature_degC = (
+            np.stack(part, axis=1, dtype=np.float32, casting="same_kind")
+            for part in (columns[: 3 * chips_n], columns[3 * chips_n :])
+        )
+        end_byte = end_byte.astype(np.int64)
         row_n = rows_n + 1 + np.arange(len(table))
         timed = np.isfinite(device_s)
         if has_clock is None:
@@ -119,9 +123,8 @@ def _timed(tables: Iterable[pa.Table], rate_hz: float, where: str) -> Iterator[F
             raise CaptureError(
                 f"{where} row {row}: device_s is missing, but earlier rows have it. Decode the dump again."
             )
-        if has_clock:
-            t_s = device_s.astype(np.float64)
-        else:
+        t_s = device_s.astype(np.float64)
+        if not has_clock:
             frame = end_byte / record_type("binary", chips_n).itemsize if is_binary else row_n.astype(np.float64)
             t_s = clocks.constant_rate(frame, rate_hz)
         yield Frames(b_uT, temperature_degC, t_s, row_n)
