@@ -1,4 +1,4 @@
-"""Tests that every door (byte stream, log, table) treats the same fault in the same way, and counts it.
+"""Tests that every door (bytes, log, table, live board) treats the same fault in the same way, and counts it.
 
 A fault of one chip in some readings is dropped and counted; a board that never answers or never changes is refused with
 a sentence that says so before any advice on units.
@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import reskin
-from reskin.board.faults import FaultDetector
-from reskin.board.wire import Frames
+from reskin.board.faults import STUCK_FRAMES_MIN_N, FaultDetector
+from reskin.board.stream import FrameStream, decode_all
+from reskin.board.wire import Frames, encode
 from reskin.errors import CaptureError
+from reskin.live.health import Health
 from reskin.logs import quiet_start
 from reskin.recordings.fault_policy import STANDARD_POLICY, FaultLog
 from reskin.recordings.readers import sd_card
@@ -41,30 +43,39 @@ def readings(name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.rint(b_uT / LSB_uT) * LSB_uT, spoilt
 
 
-def by_stream(b_uT: np.ndarray, folder: Path) -> int:
-    """Return how many frames of a stream are dropped."""
-    temperature = np.full((len(b_uT), CHIPS_N), np.nan, np.float32)
-    t_s = np.arange(len(b_uT)) / RATE_HZ
-    frames = Frames(b_uT.astype(np.float32), temperature, np.full(len(b_uT), np.nan), 82 * (1 + np.arange(len(b_uT))))
+def frames_of(b_uT: np.ndarray) -> Frames:
+    unknown = np.full(len(b_uT), np.nan)
+    failed = (b_uT.reshape(len(b_uT), CHIPS_N, 3) == FAULTS["ReSkin firmware"]).all(axis=2)
+    degC = np.where(failed, -880.49, 25.0).astype(np.float32)
+    return Frames(b_uT.astype(np.float32), degC, unknown, np.zeros(len(b_uT), np.int64))
+
+
+def by_bytes(b_uT: np.ndarray, folder: Path, torn: bool = False) -> dict[str, int]:
+    """Return what the ingestion of a byte stream counts."""
+    data = encode(frames_of(b_uT), "binary")
+    frames, account = decode_all(data[:5000] + data[5020 * torn or 5000 :], "binary", CHIPS_N, "a.bin")
     detector, log = FaultDetector(CHIPS_N, frame_bytes_n=82), FaultLog(STANDARD_POLICY, "a.bin", "ms")
     kept_n = 0
-    for rows in np.array_split(np.arange(len(b_uT)), 4):
-        part = frames.where(np.isin(np.arange(len(b_uT)), rows))
-        kept_n += int(log.apply(detector.feed(part, t_s[rows]), t_s[rows]).keep.sum())
-    return len(b_uT) - kept_n
+    for part in frames.divide(400):
+        t_s = part.end_byte / 82 / RATE_HZ
+        kept_n += int(log.apply(detector.feed(part, t_s), t_s).keep.sum())
+    return account | log.account() | {"dropped_n": len(frames) - kept_n}
 
 
-def by_log(b_uT: np.ndarray, folder: Path) -> int:
-    """Return how many lines of a log are dropped."""
-    file = folder / "log.csv"
+def by_log(b_uT: np.ndarray, folder: Path, torn: bool = False) -> dict[str, int]:
+    """Return what `reskin predict` and `load_recording` count in a log."""
     rows = np.column_stack([np.arange(len(b_uT)) / RATE_HZ, b_uT])
     names = ",".join(sd_card.column_names(CHIPS_N, temperatures=False))
-    np.savetxt(file, rows, delimiter=",", fmt="%.4f", header=names, comments="")
-    return len(b_uT) - len(sd_card.read_log(file)[0])
+    np.savetxt(folder / "log.csv", rows, delimiter=",", fmt="%.4f", header=names, comments="")
+    if torn:
+        lines = (folder / "log.csv").read_text().split("\n")
+        (folder / "log.csv").write_text("\n".join([*lines[:60], lines[60][:40], *lines[61:]]))
+    *_, account = sd_card.read_log(folder / "log.csv")
+    return account | {"dropped_n": account["rows_read_n"] - account["rows_n"]}
 
 
-def by_table(b_uT: np.ndarray, folder: Path) -> int:
-    """Return how many rows of a table are dropped."""
+def by_table(b_uT: np.ndarray, folder: Path, torn: bool = False) -> dict[str, int]:
+    """Return what `reskin add` and `load_recording` count in a table of presses."""
     file, pressed = folder / "table.csv", (np.arange(len(b_uT)) // 200) % 2 == 1
     names = ["phase", "x_mm", "y_mm", *(f"B{axis}{chip}" for chip in range(CHIPS_N) for axis in "xyz"), "Fz_N"]
     lines = [",".join(names)]
@@ -72,44 +83,129 @@ def by_table(b_uT: np.ndarray, folder: Path) -> int:
         place = f"{i // 400 * 2},{i // 800 * 3}"
         fields = ",".join(f"{value:.4f}" for value in row)
         lines.append(f"{'contact' if pressed[i] else 'noload'},{place},{fields},{2.0 * pressed[i]}")
+    lines[60] = lines[60][:40] if torn else lines[60]
     file.write_text("\n".join(lines) + "\n")
-    return int(reskin.load_recording(file).attrs["counts"]["dropped_failed_read_rows_n"])
+    counts: dict[str, int] = reskin.load_recording(file).attrs["counts"]
+    dropped_n = counts["dropped_failed_read_rows_n"] + counts["dropped_stuck_chip_rows_n"]
+    return counts | {"dropped_n": dropped_n}
 
 
-DOORS = {"stream": by_stream, "log": by_log, "table": by_table}
+def by_live(b_uT: np.ndarray, folder: Path, torn: bool = False) -> dict[str, int]:
+    """Return the alarms of a live board, and how many frames got no estimate."""
+    health, stream, used_n, sent_n = Health(CHIPS_N), FrameStream("binary", CHIPS_N), 0, 0
+    data = encode(frames_of(b_uT), "binary")
+    data = data[:5000] + data[5020 * torn or 5000 :]
+    for first in range(0, len(data), 820):
+        frames = stream.feed(data[first : first + 820])
+        used_n, sent_n = used_n + int(health.feed(frames, first / 82 / RATE_HZ).sum()), sent_n + len(frames)
+    return (
+        stream.account()
+        | {alarm.name: alarm.count_n for alarm in health.alarms.values()}
+        | {"dropped_n": sent_n - used_n}
+    )
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("door", DOORS)
-def test_failed_reads_of_one_chip_are_dropped_and_counted_at_every_door(door, fault, tmp_path):
+DOORS = {"bytes": by_bytes, "log": by_log, "table": by_table, "live": by_live}
+REFUSED = "refused: "
+# What the user sees of each fault at each door: the name of a count, or a word of the error. `spoilt` is the number of
+# readings with the fault.
+SEEN = {
+    "zeros": (
+        "fault_zeros_dropped_n",
+        "fault_zeros_dropped_n",
+        "fault_zeros_dropped_n",
+        "chip 2: zeros in place of a reading",
+    ),
+    "no answer, -1 step": ("fault_failed_read_dropped_n",) * 3 + ("chip 2: failed I2C reads",),
+    "extreme code": ("fault_failed_read_dropped_n",) * 3 + ("chip 2: failed I2C reads",),
+    "impossible for the step": ("fault_failed_read_dropped_n",) * 3 + ("chip 2: failed I2C reads",),
+    "ReSkin firmware": ("fault_failed_read_dropped_n",) * 3 + ("chip 2: failed I2C reads",),
+    "stuck": ("fault_stuck_dropped_n",) * 3 + ("chip 2: stuck",),
+    "saturated": ("fault_saturated_flagged_n",) * 3 + ("chip 2: field at the end of the range",),
+    "frozen": (
+        "fault_repeated_flagged_n",
+        REFUSED + "repeats one value",
+        REFUSED + "repeats one value",
+        "frames repeat",
+    ),
+    "all zero": (
+        "fault_zeros_dropped_n",
+        REFUSED + "I2C read",
+        REFUSED + "I2C read",
+        "chip 2: zeros in place of a reading",
+    ),
+    "never answers": (
+        "fault_failed_read_dropped_n",
+        REFUSED + "I2C read",
+        REFUSED + "I2C read",
+        "chip 2: failed I2C reads",
+    ),
+    "torn": ("skipped_resync_bytes_n", "dropped_torn_lines_n", REFUSED + "columns", "skipped_resync_bytes_n"),
+}
+
+
+def spoil(fault: str) -> tuple[np.ndarray, int]:
+    """Return readings with a fault, and how often the user should see it."""
     b_uT, spoilt = readings(fault)
-    if door == "stream" and fault.startswith("impossible"):
-        spoilt[: ROWS_N // 2] = False  # in a stream, the step is known after the first frames
-    assert DOORS[door](b_uT, tmp_path) == 0
-    b_uT[spoilt, 6:9] = FAULTS[fault]
-    assert DOORS[door](b_uT, tmp_path) == spoilt.sum()
+    match fault:
+        case "stuck":
+            b_uT[600:800, 6:9] = b_uT[600, 6:9]
+            return b_uT, 200 - STUCK_FRAMES_MIN_N + 1
+        case "saturated":
+            spoilt = (np.arange(ROWS_N) // 200) == 3
+            b_uT[spoilt, 6] = 0.15 * 2**15
+        case "frozen" | "all zero" | "never answers":
+            value = {
+                "frozen": BASE_uT,
+                "all zero": np.zeros(15),
+                "never answers": np.tile([-0.15, -0.15, -0.242], CHIPS_N),
+            }
+            return np.tile(value[fault], (ROWS_N, 1)), ROWS_N
+        case "torn":
+            return b_uT, 1
+        case _:
+            spoilt[: 400 * fault.startswith("impossible")] = False  # in a stream, 400 frames tell the step
+            b_uT[spoilt, 6:9] = FAULTS[fault]
+    return b_uT, int(spoilt.sum())
 
 
-@pytest.mark.parametrize("door", ["log", "table"])
-def test_boards_that_never_answer_or_never_change_are_refused_before_advice_on_units(door, tmp_path):
-    b_uT, _ = readings("dead")
-    for value, message in (
-        (np.tile([-0.15, -0.15, -0.242], CHIPS_N), "the I2C read of a chip failed"),
-        (np.zeros(15), "the I2C read of a chip failed"),
-        (BASE_uT, "every reading is the same.*repeats one value"),
-    ):  # fmt: skip
-        with pytest.raises(CaptureError, match=message):
-            DOORS[door](np.tile(value, (ROWS_N, 1)), tmp_path)
-    b_uT[:, 6:9] = [-0.15, -0.15, -0.242]
-    with pytest.raises(CaptureError, match="the I2C read of a chip failed"):
-        DOORS[door](b_uT, tmp_path)
+@pytest.mark.parametrize("fault", SEEN)
+@pytest.mark.parametrize("door_i", range(4), ids=DOORS)
+def test_each_fault_is_counted_or_refused_at_each_door(door_i, fault, tmp_path):
+    read, seen = list(DOORS.values())[door_i], SEEN[fault][door_i]
+    b_uT, faulty_n = spoil(fault)
+    if seen.startswith(REFUSED):
+        with pytest.raises(CaptureError, match=seen.removeprefix(REFUSED)):
+            read(b_uT, tmp_path, torn=fault == "torn")
+        return
+    counts = read(b_uT, tmp_path, torn=fault == "torn")
+    if fault == "torn" and seen.endswith("bytes_n"):
+        assert counts["skipped_resync_bytes_n"] == 2 * 82 - 20  # a torn frame and the next one are lost
+        assert counts["frames_n"] == ROWS_N - 2
+    elif fault == "stuck" and seen.startswith("chip"):
+        assert counts[seen] == faulty_n
+        assert counts["dropped_n"] >= faulty_n - 40  # live boards are checked for stuck chips once per 40 frames
+    elif fault == "frozen":
+        assert counts[seen] >= 0.9 * faulty_n
+    else:
+        assert counts[seen] == faulty_n
+        assert counts["dropped_n"] == (0 if seen.endswith("flagged_n") or fault == "torn" else faulty_n)
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_no_fault_is_found_at_any_door_in_sound_readings(door, tmp_path):
+    counts = DOORS[door](readings("sound")[0], tmp_path)
+    assert counts["dropped_n"] == 0
+    assert not [name for name in counts if name.startswith(("fault_", "chip "))]
 
 
 def test_cut_digits_and_torn_lines_of_logs_are_dropped_and_counted(tmp_path):
     b_uT, spoilt = readings("cut")
     cut = b_uT.copy()
     cut[spoilt, 8] = np.trunc(cut[spoilt, 8] / 10)
-    assert by_log(cut, tmp_path) == pytest.approx(spoilt.sum(), abs=2)  # beside the start of a press, all differ
+    assert by_log(cut, tmp_path)["dropped_n"] == pytest.approx(
+        spoilt.sum(), abs=2
+    )  # beside the start of a press, all differ
     by_log(b_uT, tmp_path)
     lines = (tmp_path / "log.csv").read_text().splitlines()
     for i in (5, 50, 500):
@@ -125,16 +221,6 @@ def test_cut_digits_and_torn_lines_of_logs_are_dropped_and_counted(tmp_path):
     (tmp_path / "torn.csv").write_text("\n".join([lines[0], *(line[:30] for line in lines[1:])]) + "\n")
     with pytest.raises(CaptureError, match="1600 of 1600 lines are torn"):
         sd_card.read_log(tmp_path / "torn.csv")
-
-
-def test_fields_at_the_end_of_the_range_of_the_detected_step_are_counted(tmp_path):
-    b_uT, _ = readings("clip")
-    limit_uT = 0.15 * 2**15 - 0.15
-    b_uT[:, 3] = np.minimum(b_uT[:, 3] + limit_uT - 320, limit_uT)
-    clipped_n = int((b_uT[(np.arange(ROWS_N) // 200) % 2 == 1, 3] == limit_uT).sum())
-    by_table(b_uT, tmp_path)
-    counts = reskin.load_recording(tmp_path / "table.csv").attrs["counts"]
-    assert counts["fault_saturated_flagged_n"] >= clipped_n > 100
 
 
 @pytest.mark.parametrize(
