@@ -123,6 +123,9 @@ def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
     Such readings come from lines whose digits were cut. In a single reading, any channels may be far from their median,
     because no press is that short. In up to `JUMP_WINDOW_N // 2` successive readings, exactly one channel of a board of
     several chips may be, because a press changes several channels.
+
+    Two doors do not use this: rows of a table may be single readings of different presses, and the estimate of a live
+    board cannot wait for the next readings.
     """
     jumps = np.zeros(len(b_uT), bool)
     if len(b_uT) < JUMP_READINGS_MIN_N:

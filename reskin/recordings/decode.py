@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
-from jaxtyping import Float32, Float64
 
 from reskin import io
 from reskin.board.custom import AnyWire
@@ -77,14 +76,6 @@ def _table(frames: Frames, schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays([pa.array(np.ascontiguousarray(column)) for column in values], schema=schema)
 
 
-def read_frames(
-    table: pa.Table, rate_hz: float, where: str, account: dict[str, int]
-) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
-    """Return time in s, field in uT and temperature in degC of the frames of a decoded dump."""
-    (frames,) = _timed([table], rate_hz, where)
-    return frames.device_s, frames.b_uT, frames.temperature_degC
-
-
 def read_frame_blocks(file: Path, rate_hz: float) -> Iterator[Frames]:
     """Yield the frames of a decoded dump; `device_s` is their time in s, and `end_byte` the number of their row.
 
@@ -92,12 +83,9 @@ def read_frame_blocks(file: Path, rate_hz: float) -> Iterator[Frames]:
     frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream, so that
     lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
     """
-    return _timed(io.read_batches(file, BLOCK_ROWS_N), rate_hz, str(file))
-
-
-def _timed(tables: Iterable[pa.Table], rate_hz: float, where: str) -> Iterator[Frames]:
+    where = str(file)
     rows_n, last_byte, has_clock, is_binary = 0, 0, None, None
-    for table in tables:
+    for table in io.read_batches(file, BLOCK_ROWS_N):
         chips_n = sum(name.startswith("temperature") for name in table.column_names)
         if table.column_names != list(frame_columns(chips_n)):
             names = ", ".join(table.column_names)[:80]

@@ -28,7 +28,6 @@ from jaxtyping import Float, Float32, Int
 from reskin import io
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.recordings import clocks, probe
-from reskin.recordings.decode import read_frames
 from reskin.recordings.header import PROBE_FILE, Header
 from reskin.recordings.ingest import read_header
 from reskin.recordings.loading import read_any_log
@@ -152,7 +151,7 @@ def read_recording(file: Path, rate_hz: float | None) -> Recording:
         return _of_readings(table, str(file), rate_hz)
     if "device_s" in table.column_names and rate_hz is None and not _all_finite(table["device_s"]):
         raise ParamsError(f"{file}: the frames have no times. State their rate, for example with --rate-hz 400.")
-    return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file), {}), str(file)))
+    return _of_log(str(file), {}, read_any_log(file, rate_hz or 1.0))
 
 
 def _of_log(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 
 from reskin.board.wire import Frames, concatenate
 from reskin.errors import CaptureError
@@ -83,24 +83,6 @@ def read_blocks(path: Path, account: dict[str, int]) -> Iterator[Frames]:
         )
     if torn_n:
         account["dropped_torn_lines_n"] = torn_n
-
-
-def keep_whole(
-    t_s: Float64[np.ndarray, " f"],
-    b_uT: Float32[np.ndarray, "f ch"],
-    temperature_degC: Float32[np.ndarray, "f k"],
-    where: str,
-    row_n: Int64[np.ndarray, " f"] | None = None,
-) -> Log:
-    """Return the fault-free frames, and an account that counts the faulty frames.
-
-    `row_n` are the numbers of the rows in errors; by default, rows are numbered from 1.
-    """
-    row_n = 1 + np.arange(len(t_s)) if row_n is None else row_n
-    account: dict[str, int] = {}
-    parts = list(check_log([Frames(b_uT, temperature_degC, t_s, row_n)], where, account))
-    kept = concatenate(parts, temperature_degC.shape[1])
-    return kept.device_s, kept.b_uT, kept.temperature_degC, account
 
 
 def _read_names(path: Path, where: str) -> list[str]:
