@@ -284,8 +284,10 @@ def read_table(path: Path) -> pa.Table:
 def read_batches(path: Path, rows_n: int) -> Iterator[pa.Table]:
     """Read a table in parts of at most `rows_n` rows, of which only one is in memory at a time."""
     with _parquet(path) as file:
-        for batch in file.iter_batches(rows_n):
-            yield pa.Table.from_batches([batch])
+        # A single iterator over the whole file would keep the compressed bytes of all row groups that it has read.
+        for group_i in range(file.metadata.num_row_groups):
+            for batch in file.iter_batches(rows_n, row_groups=[group_i]):
+                yield pa.Table.from_batches([batch])
 
 
 def read_column_names(path: Path) -> list[str]:
