@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from reskin import seeds
 from reskin.board import faults
-from tests.board.signals import frames_of
 
 NOISE_uT = 5.0  # The noise of real boards is 3.0 to 5.0 uT.
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
@@ -41,10 +40,6 @@ class TestFailedReads:
     def test_failed_read_without_a_temperature_is_recognised_by_its_fields(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
-
-    def test_failed_read_in_single_precision_is_recognised(self):
-        sent = frames_of(np.tile([8028.16, 5194.00, 12943.36], 5)[None], np.full((1, 5), -880.49))
-        assert faults.failed_reads(sent.b_uT, sent.temperature_degC).all()
 
     def test_real_recording_of_failed_reads_is_recognised(self, shared_data):
         assert faults.failed_reads(*load_ini(shared_data, "faults/b20_artillery_AFG_flex_50.head400.txt")).all()

@@ -215,14 +215,6 @@ def test_rows_are_kept_except_those_in_which_a_chip_has_failed(failed: set[tuple
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
-def test_row_in_which_a_chip_reads_zeros_is_invalid():
-    b_uT = noisy_fields_uT(50)
-    b_uT[7, 3:6] = 0.0
-    rows = check_rows(b_uT, np.full((50, CHIPS_N), 25.0), None, where="here", policy=DEFAULT_POLICY)
-    assert np.flatnonzero(~rows.keep).tolist() == [7]
-    assert rows.account()["dropped_failed_read_rows_n"] == 1
-
-
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
 def test_error_names_a_chip_whose_steps_differ_from_those_of_the_other_chips(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)
