@@ -76,15 +76,16 @@ def _table(frames: Frames, schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays([pa.array(np.ascontiguousarray(column)) for column in values], schema=schema)
 
 
-def read_frame_blocks(file: Path, rate_hz: float) -> Iterator[Frames]:
+def read_frame_blocks(file: Path, rate_hz: float, account: dict[str, int]) -> Iterator[Frames]:
     """Yield the frames of a decoded dump; `device_s` is their time in s, and `end_byte` the number of their row.
 
-    If the frames have times of the board's clock, these times are used. Otherwise, times are computed from the constant
-    frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream, so that
-    lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
+    If the frames have times of the board's clock, these times are used; at the end, `account` says if their resolution
+    was too coarse. Otherwise, times are computed from the constant frame rate `rate_hz`. In binary formats, they are
+    computed from the positions of the frames in the stream, so that lost bytes also count as time. In text formats,
+    they are computed from the numbers of the frames.
     """
     where = str(file)
-    rows_n, last_byte, has_clock, is_binary = 0, 0, None, None
+    clock, rows_n, last_byte, has_clock, is_binary = clocks.BoardClock(), 0, 0, None, None
     for table in io.read_batches(file, BLOCK_ROWS_N):
         chips_n = sum(name.startswith("temperature") for name in table.column_names)
         if table.column_names != list(frame_columns(chips_n)):
@@ -111,12 +112,14 @@ def read_frame_blocks(file: Path, rate_hz: float) -> Iterator[Frames]:
             raise CaptureError(
                 f"{where} row {row}: device_s is missing, but earlier rows have it. Decode the dump again."
             )
-        t_s = device_s.astype(np.float64)
-        if not has_clock:
+        if has_clock:
+            t_s = clock.times_of(device_s, end_byte)
+        else:
             frame = end_byte / record_type("binary", chips_n).itemsize if is_binary else row_n.astype(np.float64)
             t_s = clocks.constant_rate(frame, rate_hz)
         yield Frames(b_uT, temperature_degC, t_s, row_n)
         rows_n, last_byte = rows_n + len(table), int(end_byte[-1]) if len(table) else last_byte
+    account.update(clock.account)
 
 
 def frame_columns(chips_n: int) -> dict[str, str]:

@@ -51,7 +51,7 @@ def read_log_blocks(log: Path, rate_hz: float, account: dict[str, int]) -> Itera
     elif not 0 < rate_hz <= RATE_MAX_HZ:
         raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} must be above 0 and at most {RATE_MAX_HZ:g}.")
     elif log.is_file() and io.is_parquet(log):
-        return check_log(read_frame_blocks(log, rate_hz), str(log), account)
+        return check_log(read_frame_blocks(log, rate_hz, account), str(log), account)
     return check_log(sd_card.read_blocks(log, account), str(log), account)
 
 
