@@ -2,7 +2,7 @@
 # make test    checks the style, the types and the imports between packages, then runs the tests
 # make lint    only checks the style, the types and the imports
 # make ui      starts the MLflow UI, which shows the runs that are stored in this checkout
-# make bench   runs the benchmarks at full size (`make test` runs each of them at a tiny size), and slow tests
+# make bench   runs the benchmarks (python -m tools.benchmarks --help lists all), then the tests including slow ones
 # make constraints   finds the newest compatible versions -> constraints.txt; then run make test, and commit
 # make clean   removes the files made by the targets above, except data and results
 
@@ -59,9 +59,8 @@ ui: $(STAMP)
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest -s -q -p no:xdist tests/benchmarks \
-		tests/stages tests/experiments tests/models tests/live/test_gripper.py \
-		tests/recordings/readers/test_lateness.py tests/test_numerics.py tests/test_tracking.py tests/test_tutorial.py
+	$(BIN)/python -m tools.benchmarks
+	RESKIN_SLOW_TESTS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 constraints: $(STAMP)
 	$(BIN)/python -m release.constraints

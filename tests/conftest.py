@@ -17,7 +17,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, jaxtyped
 
-from tests.benchmarks import FULL
+from tests.sizes import FULL
 
 # No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that tests
 # of unchanged code do not begin to fail. With `--hypothesis-profile=thorough`, many other examples are drawn.

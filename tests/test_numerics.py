@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from reskin.models.reproducible import affine, affine_layers, exp
 from reskin.numerics import BEYOND_AVX2, PINNED, TOO_LATE, VARIABLES, cpu_flags, departures, pinned
 from reskin.seeds import rng_for
-from tests.benchmarks import size
+from tests.sizes import size
 
 ROOT = Path(__file__).resolve().parents[1]
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})

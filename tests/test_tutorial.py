@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from tests.benchmarks import FULL
+from tests.sizes import FULL
 from tests.tutorial import PAGE, Done, Step, checkout_copy, differences, read_steps, run, shown, write
 
 pytestmark = [
@@ -13,7 +13,7 @@ pytestmark = [
 ]
 
 
-@pytest.mark.skipif(not FULL, reason="takes minutes: RESKIN_BENCHMARKS=full")
+@pytest.mark.skipif(not FULL, reason="takes minutes: RESKIN_SLOW_TESTS=1")
 def test_commands_of_the_page_print_its_outputs():
     steps = read_steps(PAGE.read_text(encoding="utf-8"))
     with checkout_copy() as folder:

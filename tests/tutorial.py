@@ -1,7 +1,7 @@
 """Run docs/tutorial.md: its commands in a copy of the checkout, in order, with their outputs.
 
 `python -m tests.tutorial --write` runs all steps (about ten minutes) and replaces the outputs on the page.
-tests/test_tutorial.py runs the quick steps, or all of them with RESKIN_BENCHMARKS=full, and compares the outputs.
+tests/test_tutorial.py runs the quick steps, or all of them with RESKIN_SLOW_TESTS=1, and compares the outputs.
 
 A step is a block of code (sh or python). The block of text that follows is the output of the step. An HTML comment
 before a step has options, separated by semicolons:

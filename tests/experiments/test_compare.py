@@ -11,10 +11,10 @@ from pipeline.fitting.presses import RecordedPresses, pool, thin
 from pipeline.report.tables import compare
 from reskin.recordings.readers import lab
 from reskin.universal.law import simulate_uT
-from tests.benchmarks import FULL
 from tests.fitting.recorded import AXES, SETUP, TRUE, simulated_presses
 from tests.recordings.test_recordings import LAB, ingest
 from tests.report.synthetic import texts_of
+from tests.sizes import FULL
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from reskin.seeds import rng_for
-from tests.benchmarks import size
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
+from tests.sizes import size
 
 SEEDS = range(size(12, 2))  # Each seed gives another skin and another network.
 

@@ -29,8 +29,8 @@ from pipeline.report.claims import read_claims, resolve
 from pipeline.report.numbers import join, timed_rows
 from reskin import io
 from reskin.models.inputs import Scaler
-from tests.benchmarks import FULL
 from tests.compiled import compile_kernels
+from tests.sizes import FULL
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
 LEARNING = ("train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "audit")

@@ -16,8 +16,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.readers import ini
 from reskin.recordings.readers.alignment import find_change
 from reskin.seeds import rng_for
-from tests.benchmarks import size
 from tests.recordings.headers import DEFAULT_POLICY, make_header
+from tests.sizes import size
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
 AT_END_ROWS_N = 100  # A missing row that is nearer to the start or the end than this may remain undetected.

@@ -1,9 +1,8 @@
 """Compare the results of a scene under different numbers of threads, processor instructions and Python versions.
 
-Run `python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]`. Under each setting, a reduced scene quick
-(one skin per board, all passes and steps, experiments single_random, lobo and triplet) runs in a new clone of the last
-commit, without cached results. Its numbers are compared with those under the first setting. The program adds to
-docs/measured/repeat.json and writes docs/repeat.md.
+Under each setting, a reduced scene quick (one skin per board, all passes and steps, experiments single_random, lobo and
+triplet) runs in a new clone of the last commit, without cached results. Its numbers are compared with those under the
+first setting. The program adds to docs/measured/repeat.json and writes docs/repeat.md.
 """
 
 import argparse
@@ -22,7 +21,7 @@ from pipeline.manage.verify import flatten
 from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
-from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
+from tools.benchmarks.common import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
 SKINS_N = 6  # one skin on each board

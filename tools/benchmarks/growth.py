@@ -1,23 +1,21 @@
-"""Measure CPU seconds and memory of each stage and of DVC for growing numbers of skins or recorded captures.
+"""CPU seconds and memory of each stage and of DVC for growing numbers of skins or recorded captures.
 
-`python -m tests.benchmarks.time_growth skins 18 60 180 600 1800` runs the whole pipeline on scenes with these numbers
-of simulated skins and 65 pokes per skin. Only 18 skins are simulated; the others are copies under other labels, which
-cost the same in all later stages. `python -m tests.benchmarks.time_growth captures 10 30 100` creates these numbers of
-recorded captures and times four commands: `reskin add` of one more capture, the first `dvc repro`, a `dvc repro` that
-has nothing to do, and the `dvc repro` after another `reskin add`. The results are added to docs/measured/growth.json,
-from which show_growth.py writes docs/growth.md. Costs are CPU seconds because other work on the machine changes them
-least.
+`skins 18 60 180 600 1800` runs the whole pipeline on scenes with these numbers of simulated skins and 65 pokes per
+skin. Only 18 skins are simulated; the others are copies under other labels, which cost the same in all later stages.
+`captures 10 30 100` creates these numbers of recorded captures and times four commands: `reskin add` of one more
+capture, the first `dvc repro`, a `dvc repro` that has nothing to do, and the `dvc repro` after another `reskin add`.
+The results are added to docs/measured/growth.json and printed as tables. CPU seconds are given because other work on
+the machine changes them least.
 """
 
 import argparse
 import json
 import os
 import shutil
-import subprocess
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +27,8 @@ from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
 from reskin.recordings.header import HEADER_FILE, make_header, write_capture
-from tests.benchmarks.pages import MEASURED
-from tests.stages.checkout import PROGRAMS, ROOT, copy_checkout, variables
+from tests.stages.checkout import PROGRAMS, copy_checkout, variables
+from tools.benchmarks.common import MEASURED, ROOT, run, table
 
 SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
 STEPS_N = 100  # Steps per training run. They are few, because the cost of a step does not depend on the number of rows.
@@ -38,16 +36,8 @@ READINGS_N = 40  # Readings per recorded capture. They are few, so that the over
 
 
 def time_command(folder: Path, *words: str) -> dict[str, float]:
-    """Run a program; return CPU and wall seconds, including child processes, and the largest peak memory."""
-    command, start_s = [str(PROGRAMS / words[0]), *words[1:]], time.monotonic()
-    log = folder / "said.txt"
-    with log.open("w") as output:
-        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=output, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(started.pid, 0)
-    if status:
-        raise AssertionError(f"{' '.join(words)} failed:\n{log.read_text()[-3000:]}")
-    wall_s, cpu_s = time.monotonic() - start_s, usage.ru_utime + usage.ru_stime
-    return {"cpu_s": round(cpu_s, 2), "wall_s": round(wall_s, 1), "peak_MB": round(usage.ru_maxrss * 1024 / 1e6)}
+    """Run a program of the environment in the copy; return its cost."""
+    return run([str(PROGRAMS / words[0]), *words[1:]], folder, **variables(folder))
 
 
 @contextmanager
@@ -172,30 +162,36 @@ def grow_captures(captures_n: int) -> dict[str, Any]:
         return {"captures_n": captures_n, "lock_bytes_n": lock_bytes_n, "steps": found}
 
 
-def keep(out: Path, part: str, point: Mapping[str, Any], count: str) -> None:
-    """Write a measurement to the file `out`, replacing an earlier measurement of the same count."""
-    before: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {}
-    others = [row for row in before.get(part, []) if row[count] != point[count]]
-    stamp = {"git": code_version(), "machine": machine()}
-    out.write_text(
-        json.dumps(before | stamp | {part: sorted([*others, point], key=lambda row: row[count])}, indent=1) + "\n"
-    )
-
-
 def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("skins", "captures"))
     parser.add_argument("counts", type=int, nargs="+")
     parser.add_argument("--out", type=Path, default=MEASURED / "growth.json")
-    arguments = parser.parse_args(words)
-    with tempfile.TemporaryDirectory() as temporary:
-        for count in arguments.counts:
-            if arguments.part == "skins":
-                point, name = grow_skins(count, Path(temporary) / "raw"), "skins_n"
-            else:
-                point, name = grow_captures(count), "captures_n"
-            print(json.dumps(point), flush=True)
-            keep(arguments.out, arguments.part, point, name)
+    given = parser.parse_args(words)
+    found: dict[str, Any] = json.loads(given.out.read_text()) if given.out.exists() else {}
+    points = {point[f"{given.part}_n"]: point for point in found.get(given.part, [])}
+    with tempfile.TemporaryDirectory() as folder:
+        for count in given.counts:
+            skins = given.part == "skins"
+            points[count] = grow_skins(count, Path(folder) / "raw") if skins else grow_captures(count)
+            found |= {"git": code_version(), "machine": machine(), given.part: [points[n] for n in sorted(points)]}
+            given.out.write_text(json.dumps(found, indent=1) + "\n")
+    print(table_of(found[given.part], given.part))
+
+
+def table_of(points: Sequence[Mapping[str, Any]], part: str) -> str:
+    """Return a row of CPU seconds for each stage or command, and the slope between the last two counts (log-log)."""
+    counts, costs = (
+        [point[f"{part}_n"] for point in points],
+        [point.get("stages") or point["steps"] for point in points],
+    )
+    rows = []
+    for name in costs[-1]:
+        cpu_s = [cost[name]["cpu_s"] for cost in costs]
+        rows.append({"CPU s": name} | dict(zip(counts, cpu_s, strict=True)))
+        if len(counts) > 1 and min(cpu_s[-2:]) > 0:
+            rows[-1]["slope"] = f"{log(cpu_s[-1] / cpu_s[-2]) / log(counts[-1] / counts[-2]):.2f}"
+    return table(rows)
 
 
 if __name__ == "__main__":

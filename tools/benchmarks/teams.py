@@ -1,8 +1,8 @@
 """Run a team's workflow on this machine: PostgreSQL, MLflow, DVC remotes, merging the recordings of two people.
 
-Run `python -m tests.benchmarks.teams`. The program starts servers on the loopback address and always
-stops them, even after a failure; all files are in one temporary folder. A table of the steps and their seconds is
-written to docs/measured/teams.md.
+The program starts servers on the loopback address and always stops them, even after a failure; all files are in one
+temporary folder. A table of the steps and their seconds is written to docs/measured/teams.md. It needs `pip install -e
+'.[team]' 'moto[server]'`.
 """
 
 import argparse
@@ -26,7 +26,8 @@ from ruamel.yaml import YAML
 
 import reskin
 from deploy import servers
-from tests.benchmarks.steps import ROOT, Steps, end_on_signals, require
+from pipeline.provenance import code_version
+from tools.benchmarks.common import ROOT, Steps, describe_machine, end_on_signals, table
 
 SCENE = "team"
 SETTINGS = {
@@ -87,6 +88,11 @@ class Clone:
     def commit(self, sentence: str) -> None:
         self.git("add", "--all")
         self.git("commit", "--quiet", "-m", sentence)
+
+
+def require(condition: bool, what: str) -> None:
+    if not condition:
+        raise RuntimeError(what)
 
 
 def run(words: list[str], folder: Path, variables: Mapping[str, str], *, check: bool = True) -> str:
@@ -277,17 +283,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/measured/teams.md")
     parser.add_argument("--keep", type=Path, help="folder for all files of the workflow; it is kept")
-    arguments = parser.parse_args()
+    given = parser.parse_args()
     end_on_signals()
     steps = Steps()
     with ExitStack() as kept:
-        folder = arguments.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
+        folder = given.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
         folder.chmod(0o755)  # PostgreSQL runs as another user
         run_steps(steps, folder.resolve())
-    steps.write(
-        arguments.out,
-        "`python -m tests.benchmarks.teams`: two people share runs and recordings, on one machine.",
-    )
+    heading = f"Two people share runs and recordings, on one machine. Code {code_version()}, {describe_machine()}."
+    given.out.write_text(f"{heading}\n\n{table(steps.rows)}\n")
 
 
 if __name__ == "__main__":
