@@ -126,23 +126,6 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
     assert str(found or "") in stderr
 
 
-@pytest.mark.parametrize(("factor", "named"), [(1.0, False), (0.1, True), (1e3, True)])
-def test_places_in_another_unit_are_named(factor, named):
-    place_mm = factor * np.array([(x, y) for x in (1.0, 6, 15) for y in (1.0, 8, 15)])
-    chips_mm = np.array([[-5.0, 0], [5, 0], [0, 5], [0, -5], [0, 0]])
-    assert ("convert them to mm" in add._other_unit(place_mm, chips_mm)) == named
-
-
-def test_recording_is_not_compared_with_the_skin_if_the_scene_has_no_section_compare(
-    root, lab_file, monkeypatch, capsys
-):
-    monkeypatch.setattr(
-        "pipeline.fitting.frames.find_departure", lambda *_: pytest.fail("find_departure must not be called")
-    )
-    add_lab(root, lab_file)
-    assert "warning" not in capsys.readouterr().err
-
-
 def test_recording_with_repeated_readings_is_added_with_a_warning(root, tmp_path, capsys):
     """If a recorder reads faster than the chips convert, it writes each reading twice."""
     press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
@@ -196,11 +179,6 @@ def test_folder_left_by_a_killed_add_is_reported(root, lab_file):
     assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed before")
 
 
-def test_errors_name_the_file_that_the_user_has_given(root, tmp_path):
-    (tmp_path / "mine.csv").write_bytes(b"indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,Fx,Fy,Fz\n")
-    assert_refused(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
-
-
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
 def test_invalid_rate_is_an_error(root, tmp_path, rate_hz):
     for name in ("dump.bin", "probe.csv"):
@@ -222,11 +200,6 @@ def test_capture_without_labels_is_an_error(tmp_path):
     write_capture(folder, header, {"stream.bin": encode(FRAMES, "binary")})
     with pytest.raises(CaptureError, match="no labels. Add --probe .* or record with --labels"):
         preparing.native(folder, labels(), None, ())
-
-
-def test_times_given_as_marks_are_written_to_the_header(tmp_path):
-    header, _ = preparing.native(native_folder(tmp_path / "run1"), labels(), None, preparing.parse_marks(["1.5,2e1"]))
-    assert header.clock.marks == ((0.0, 0.0), (1.5, 20.0))
 
 
 @pytest.mark.parametrize(
@@ -264,26 +237,11 @@ def test_error_for_a_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
         raise ReskinError("capture c", "its name", "new", "one that is taken", "Choose another.")
 
 
-def test_recording_in_a_wrong_layout_is_an_error(root, lab_file):
-    for layout in ("ini", "eflesh", "leaphand"):
-        assert_refused(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
-    assert_refused(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
-
-
 @pytest.mark.parametrize("name", ["../up", "a b", "", "x" * 80, "ä", "/abs"])
 def test_invalid_name_is_an_error(root, lab_file, tmp_path, name):
     assert_refused(root, lambda: add_lab(root, lab_file, board=name), "--board: a name must be")
     folder = native_folder(tmp_path / "run1")
     assert_refused(root, lambda: preparing.native(folder, labels(name=name), None, ()), "--name: a name must be")
-
-
-def test_unknown_scene_is_an_error(root, lab_file):
-    prepared = preparing.foreign(lab_file, "lab", labels(), {})
-    assert_refused(
-        root,
-        lambda: add.add(root, "smal", prepared, allow_copy=False),
-        "no scene smal. Did you mean small?.* reskin new smal",
-    )
 
 
 def test_recording_cannot_be_added_to_a_simulated_scene(root, lab_file):
@@ -330,12 +288,6 @@ def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary"), source
     files = {"stream.bin": stream, "probe.csv": probe.render(probe_log()).encode()}
     write_capture(folder, header, files)
     return folder
-
-
-def test_simulated_capture_cannot_be_added_to_a_scene_that_simulates_its_own_captures(root, tmp_path):
-    folder = native_folder(tmp_path / "run1", source="simulated")
-    prepared = preparing.native(folder, labels(), None, ())
-    assert_refused(root, lambda: add.add(root, "ci", prepared, allow_copy=False), "ci simulates its own captures")
 
 
 def test_recording_of_an_emulated_board_can_be_added_to_a_scene_for_emulated_boards(root, tmp_path):
@@ -443,36 +395,11 @@ def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_reskin_add_prints_the_command_that_runs_the_scene(root_with_code, lab_file, monkeypatch):
-    monkeypatch.chdir(root_with_code)
-    arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    done = run(root_with_code, "reskin", *arguments)
-    assert "next: reskin scenes use small && dvc repro" in done.stdout
-    assert "dvc config" not in done.stdout + done.stderr
-    plan.use(root_with_code, ["small"])
-    assert "is up to date; scenes: small" in output_of(["scenes", "check"])
-    taken = output_of([*arguments, "--layout", "table"])
-    assert "the scene already has a capture with the name b_s_readings" in taken
-    assert "It can be read with" not in taken
-    again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
-    assert "added small/again" in again
-    assert "switched" not in again
-
-
 def test_recording_without_contact_is_an_error_if_no_experiment_of_the_scene_uses_it(root, tmp_path):
     write_leaphand(tmp_path, numbers(30))
     prepared = preparing.foreign(tmp_path / leaphand.READINGS, "leaphand", labels(), {"pad": "1"})
     message = "nothing touches the skin in this recording, and no experiment of scene small uses such recordings"
     assert_refused(root, lambda: add.add(root, "small", prepared, allow_copy=False), message)
-
-
-def test_stage_split_fails_without_traceback_if_the_scene_has_only_one_board(root_with_code, lab_file):
-    add_lab(root_with_code, lab_file)
-    plan.use(root_with_code, ["small"])
-    done = run(root_with_code, "dvc", "repro", "split@small", check=False)
-    assert done.returncode != 0
-    assert "experiment lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
-    assert "Traceback" not in done.stderr + done.stdout
 
 
 def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(root, tmp_path, monkeypatch):
@@ -496,26 +423,6 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
         section = read_settings(name, root).section(NewBoard, "new_board")
         assert (section.model is not None, section.presses_n, section.labels_n) == (tested, (4,), (0, 1))
     assert read_settings("own", root).section(Compare, "compare").layout.gap_mm == 2
-
-
-def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(root)
-    monkeypatch.setattr("pipeline.fitting.frames.find_departure", lambda *_: None)
-    output_of(["new", "mine", "--boards", "b1,b2", "--presses", "20", "--passes", "2"])
-    rng = rng_for(0, "passes")
-    places_mm = np.concatenate([rng.permutation([[i, i % 5] for i in range(20)]) for _ in range(2)])
-    rows = pd.DataFrame({"phase": ["noload", "contact"] * 40, "pass": [0] * 40 + [1] * 40})
-    rows[["x_mm", "y_mm"]] = places_mm.repeat(2, axis=0)
-    for name, stated in (("b1_s1", False), ("b2_s1", True)):
-        rows[table.columns_of(5)[3:18]] = 500.0 + rng.normal(0, 30, (80, 15))
-        (rows if stated else rows.drop(columns="pass")).to_csv(tmp_path / f"{name}.csv", index=False)
-        prepared = preparing.foreign(tmp_path / f"{name}.csv", "table", labels(name[:2], name), {})
-        add.add(root, "mine", prepared, allow_copy=False)
-        warned = (
-            "1 passes, but with split.pool_passes_n: 1 the scene needs more than 1 passes of each skin. Add further"
-        )
-        output = capsys.readouterr().err
-        assert (warned in output, "fill in column pass" in output) == (not stated, not stated)
 
 
 def test_board_and_skin_of_several_recordings_are_taken_from_the_names_of_their_files(root, tmp_path, monkeypatch):

@@ -15,9 +15,7 @@ import pytest
 
 from pipeline import FLOW, PLAN, SCENES, plan
 from pipeline.scores import read_scores
-from reskin import code, io
-from reskin.models.job import CODE_MODULES, JobKeys
-from tests.models.example_jobs import example_data, pooled
+from reskin import io
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
@@ -155,24 +153,3 @@ def test_edit_of_code_reruns_its_experiment_and_the_report(root, before):
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert stale_stages(before, after) == {"shear@ci", "report@ci"}
-
-
-def test_edited_comments_do_not_change_the_keys_of_cached_training_runs(tmp_path, monkeypatch):
-    files = {name: f"{name.replace('.', '/')}.py" for name in CODE_MODULES}
-    sources = {name: (ROOT / file).read_text() for name, file in files.items()}
-    (tmp_path / "reskin/models").mkdir(parents=True)
-    monkeypatch.setattr(code, "ROOT", tmp_path)
-
-    def key(sources: dict[str, str]) -> str:
-        for name, text in sources.items():
-            (tmp_path / files[name]).write_text(text)
-        code.digest.cache_clear()
-        return JobKeys(example_data()).key(pooled())
-
-    commented = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
-    assert (
-        key(commented)
-        == key(sources)
-        != key(sources | {"reskin.models.train": sources["reskin.models.train"] + "\nWEIGHT = 1.0\n"})
-    )
-    code.digest.cache_clear()

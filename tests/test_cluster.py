@@ -68,12 +68,6 @@ def environment(monkeypatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-def test_error_on_a_worker_is_raised_in_the_client(cluster, monkeypatch):
-    monkeypatch.setenv("RESKIN_EXECUTOR", f"dask:{cluster.address}")
-    with make_executor(imports="json") as executor, pytest.raises(ValueError, match="invalid literal"):
-        executor.submit(int, "x").result()
-
-
 @pytest.mark.parametrize(("variable", "value"), [("OMP_NUM_THREADS", "2"), ("RESKIN_DEVICE", "cuda")])
 def test_worker_with_another_environment_is_an_error(cluster, monkeypatch, variable, value):
     monkeypatch.setenv("RESKIN_EXECUTOR", f"dask:{cluster.address}")

@@ -2,8 +2,6 @@
 
 import pytest
 
-from pipeline.catalogue import module_name
-from pipeline.stages.code import all_stages
 from reskin import code
 
 SOURCE = '''"""A module."""
@@ -64,15 +62,3 @@ def test_digest_includes_imported_modules_of_the_packages():
 
 def test_digest_of_a_stage_includes_the_modules_of_the_library_that_it_uses():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
-
-
-@pytest.mark.parametrize("stage", sorted({*all_stages()} - {"report"}))
-def test_stages_that_compute_results_import_nothing_of_the_report(stage):
-    assert not [name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")]
-
-
-def test_backup_files_of_editors_do_not_change_the_digest(monkeypatch, tmp_path):
-    before = digest(monkeypatch, tmp_path, SOURCE)
-    (tmp_path / "pipeline/one.py~").write_text("old")
-    (tmp_path / "pipeline/one.py.orig").write_text("old")
-    assert digest(monkeypatch, tmp_path, SOURCE) == before

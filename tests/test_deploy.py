@@ -7,34 +7,15 @@ import time
 from pathlib import Path
 
 import pytest
-from ruamel.yaml import YAML
 
 from deploy.servers import ServerError, running
 
 ROOT = Path(__file__).resolve().parents[1]
-DASK = ["sh", "deploy/dask.sh"]
-MANIFEST = list(YAML(typ="safe").load_all((ROOT / "deploy/kubernetes/reskin.yaml").read_text()))
-PODS = [part["spec"]["template"] for part in MANIFEST if "template" in part["spec"]]
 
 
 @pytest.mark.parametrize(("shell", "script"), [("sh", "deploy/dask.sh"), ("bash", "deploy/slurm/reskin.sbatch")])
 def test_scripts_are_valid_shell(shell, script):
     subprocess.run([shell, "-n", script], cwd=ROOT, check=True)
-
-
-def test_unknown_command_of_the_dask_script_is_an_error():
-    finished = subprocess.run([*DASK, "start"], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (finished.returncode, "must be scheduler, worker or run; got 'start'" in finished.stderr) == (2, True)
-
-
-def test_pods_of_the_manifest_run_the_script_with_the_address_of_the_scheduler():
-    commands = [container["command"] for pod in PODS for container in pod["spec"]["containers"]]
-    assert [command[:2] for command in commands] == [DASK] * 3
-    assert [command[2] for command in commands] == ["scheduler", "worker", "run"]
-    service = next(part for part in MANIFEST if part["kind"] == "Service")
-    address = f"tcp://{service['metadata']['name']}:{service['spec']['ports'][0]['port']}"
-    assert [command[3] for command in commands[1:]] == [address] * 2
-    assert service["spec"]["selector"] == PODS[0]["metadata"]["labels"]
 
 
 def test_program_and_its_child_processes_end_at_the_end_of_the_with_block(tmp_path):

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pipeline.description import describe, over_skins, pace, without_rest
+from pipeline.description import describe, over_skins, pace
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from tests.data.tables import readings
@@ -65,18 +63,10 @@ def test_changes_of_a_random_walk_at_rest_grow_with_the_root_of_the_number_of_co
     assert describe(without_walk)["rest_changes_in_100_uT"] == 0
 
 
-def test_recording_without_clock_has_no_rate():
-    assert "rate_hz" not in describe(replace(example_readings(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
-
-
 def test_motion_between_stops_is_not_counted_as_noise():
     line = example_readings()
     moved = replace(line, indentation=line.indentation // 2, x_mm=(line.indentation % 2).astype(np.float32))
     assert describe(moved)["noise_z_uT"] == describe(line)["noise_z_uT"]
-
-
-def test_no_field_change_is_given_for_forces_that_were_not_reached():
-    assert {"change_at_0.5_N_uT", "change_at_1_N_uT", "change_at_3_N_uT"}.isdisjoint(describe(example_readings()))
 
 
 def test_field_is_described_without_forces():
@@ -109,17 +99,6 @@ def test_ratio_of_field_changes_at_two_forces_uses_all_captures_of_a_skin():
     summary = over_skins([("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})])
     assert summary["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
     assert summary["change_at_3_N_over_1_N"]["n"] == 1
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
-def test_mean_over_skins_is_between_minimum_and_maximum(values):
-    one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
-    assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
-
-
-def test_without_rest_drops_all_values_at_rest():
-    description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
-    assert without_rest(description) == {"rate_hz": 9.0}
 
 
 def test_largest_force_of_a_skin_is_the_largest_of_all_its_captures():

@@ -11,19 +11,15 @@ from sklearn.utils.estimator_checks import check_estimator
 
 import reskin
 from reskin import metrics
-from reskin.config import parse, read_yaml
+from reskin.config import parse
 from reskin.errors import ParamsError, SchemaError, TrainingError
 from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import Recipe
 from reskin.models.train import train_stack
 from tests.models.example_jobs import some_rows
-from tests.test_api import ROOT
 
 ROUNDING = "in single precision, the rounding of a prediction depends on the other rows of the same call"
 CONTACT_FAILS = dict.fromkeys(["check_methods_sample_order_invariance", "check_methods_subset_invariance"], ROUNDING)
-OTHER_DATA = (
-    "the check fits data with another number of channels than the board has, or other targets than x, y and force"
-)
 TITLES = {"steps_n": 4, "batch_n": 16}
 
 
@@ -43,14 +39,6 @@ def poke_rows(n: int = 48, board: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 def network_of(regressor: reskin.ContactRegressor) -> dict[str, np.ndarray]:
     return dict(regressor.network_.tensors)
-
-
-def test_default_settings_of_contact_regressor_are_the_recipe_of_the_paper():
-    settings = read_yaml(ROOT / "params.yaml")["recipes"]["paper"]
-    settings["steps_n"] = read_yaml(ROOT / "pipeline/scenes/lab.yaml")["train_multi"]["steps_n"]
-    defaults = reskin.ContactRegressor().get_params()
-    assert {name: defaults[name] for name in settings} == settings
-    assert defaults.keys() - settings.keys() == {"random_state"}
 
 
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])

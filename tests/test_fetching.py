@@ -175,16 +175,6 @@ def test_unknown_source_is_an_error_and_no_source_lists_all(monkeypatch):
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_each_source_has_all_files_of_its_recordings_and_a_known_scene(name):
-    source, paths = SOURCES[name], {Path(path) for path in SOURCES[name].files}
-    for recording in source.recordings:
-        assert paths & {Path(recording.path), *(path for path in paths if Path(recording.path) in path.parents)}
-    assert bool(source.recordings) == (source.scene is not None)
-    assert source.scene is None or plan.scene_file(ROOT, source.scene).is_file()
-    assert (source.base is None) == (source.how is not None)
-
-
-@pytest.mark.parametrize("name", SOURCES)
 def test_real_recordings_match_their_hashes_and_are_read(name, shared_data, tmp_path):
     folder = shared_data / {"eflesh_forces": "eflesh"}.get(name, name)
     for path in SOURCES[name].files:
@@ -197,15 +187,3 @@ def test_real_recordings_match_their_hashes_and_are_read(name, shared_data, tmp_
         header = preparing.headers.write_capture(tmp_path / prepared[0].capture, *prepared)
         _, account = READERS[recording.layout].read(tmp_path / header.capture, header, DEFAULT_POLICY)
         assert account["rows_read_n"] == counts[name]
-
-
-@pytest.mark.timeout(600)
-def test_recordings_of_real_boards_are_added_to_scene_lab(shared_data, tmp_path, monkeypatch):
-    root = copy_checkout(tmp_path)
-    plan.use(root, ["quick"])
-    monkeypatch.chdir(root)
-    done = CliRunner().invoke(app, ["fetch", "lab", "--yes", "--from", str(shared_data / "lab")])
-    assert "next: reskin scenes use lab; dvc repro" in done.stdout
-    captures = read_registry(root).captures["lab"]
-    assert {(entry.board, entry.skin) for entry in captures.values()} == {("board1", "skin1"), ("board2", "skin2")}
-    assert len(captures) == 6

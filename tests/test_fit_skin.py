@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from tests.fitting.recorded import AXES, TRUE, simulated_presses
@@ -19,21 +18,6 @@ def test_fit_finds_the_slide_and_the_amplitude_of_a_simulated_board(monkeypatch)
     assert found["away_um_mm"] == pytest.approx(true.away_um_mm, abs=0.7)
     assert (found["give_x_um"], found["give_y_um"]) == pytest.approx((true.give_x_um, true.give_y_um), abs=4)
     assert found["amplitude"] == pytest.approx(true.amplitude, rel=0.05)
-
-
-def test_spread_is_the_standard_deviation_over_boards_of_the_linear_fits():
-    rows = [
-        {"fit": name, "board": board} | dict.fromkeys(fit_skin.SHOWN, 1.0) | {"away_um_mm": away, "give_x_um": give}
-        for name, board, away, give in (
-            ("linear", "one", 10.0, 40.0),
-            ("linear", "two", 14.0, 60.0),
-            ("hard", "one", 0, 0),
-        )
-    ]
-    table = fit_skin.over_boards(pd.DataFrame(rows))
-    assert table.loc["away_um_mm"].tolist() == pytest.approx([12.0, np.sqrt(8)])
-    # The variances are 200 along x and 0 along y.
-    assert table.loc[["give_x_um", "give_y_um"], "spread"].tolist() == pytest.approx([10.0, 10.0])
 
 
 def test_places_are_resampled_with_all_of_their_presses():

@@ -1,6 +1,3 @@
-import errno
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +7,7 @@ import pytest
 import safetensors.numpy
 
 from reskin import io
-from reskin.errors import SchemaError, explaining
+from reskin.errors import SchemaError
 from reskin.schema import UNITS
 from tests.data.tables import readings
 
@@ -68,49 +65,6 @@ def test_old_file_is_kept_if_writing_the_new_one_fails(tmp_path):
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
-def test_os_errors_name_the_file_that_could_not_be_read_or_written(tmp_path):
-    def names_in_errors(*names: Path) -> tuple[str, ...]:
-        """Return the file that each error names.
-
-        Writing a.txt to a folder with the files `names` raises EACCES, ENOSPC and EIO in turn.
-        """
-        found = []
-        for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
-            metadata = (names[0], None, names[1]) if len(names) == 2 else names
-            with pytest.raises(OSError, match="refused") as raised, io.replacing(tmp_path / "a.txt"):
-                raise OSError(number, "refused", *metadata)
-            found.append("" if raised.value.filename is None else Path(raised.value.filename).name)
-        return tuple(found)
-
-    source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
-    assert names_in_errors(source) == ("source", "source", "source")
-    assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    # If a file is copied, EIO may be caused by either of the two files.
-    assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")
-    assert names_in_errors() == ("a.txt", "a.txt", "")
-
-
-def test_error_for_a_read_only_disk_names_the_target(tmp_path, monkeypatch):
-    def refuse(path: Path) -> None:
-        raise OSError(errno.EROFS, "Read-only file system", str(path))
-
-    monkeypatch.setattr(io, "remove", refuse)
-    with pytest.raises(OSError, match="Read-only") as raised:
-        io.write_text(tmp_path / "a.txt", "new")
-    assert raised.value.filename == str(tmp_path / "a.txt")
-
-
-def test_error_for_an_unreadable_source_names_the_source(tmp_path):
-    with (
-        pytest.raises(IsADirectoryError, match="source"),
-        explaining("ingest_many"),
-        io.replacing(tmp_path / "copy") as temporary,
-    ):
-        (tmp_path / "source").mkdir()
-        shutil.copyfile(tmp_path / "source", temporary)
-    assert not (tmp_path / "copy").exists()
-
-
 def read_texts(folder: Path) -> dict[str, str]:
     return {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
@@ -130,13 +84,6 @@ def test_old_folder_is_kept_if_writing_one_of_its_texts_fails(tmp_path):
         io.write_texts(tmp_path / "tables", {"a.md": "new", "b.md": "half a pair: \ud800"})
     assert read_texts(tmp_path / "tables") == {"a.md": "old", "b.md": "old"}
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
-
-
-@pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
-def test_non_parquet_file_is_an_error(tmp_path, content):
-    (tmp_path / "c0.parquet").write_bytes(content)
-    with pytest.raises(SchemaError, match=r"c0.parquet: the file cannot be read as a Parquet file"):
-        io.read_readings(tmp_path / "c0.parquet")
 
 
 def test_wrong_unit_is_an_error(tmp_path):
@@ -160,12 +107,6 @@ def test_write_json_raises_if_a_value_is_nan(tmp_path):
     with pytest.raises(ValueError, match="Out of range float"):
         io.write_json(tmp_path / "a.json", {"x": float("nan")})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_broken_safetensors_are_an_error(tmp_path):
-    (tmp_path / "m.safetensors").write_bytes(b"junk")
-    with pytest.raises(SchemaError, match="cannot be read as a safetensors file"):
-        io.read_tensors(tmp_path / "m.safetensors")
 
 
 def flip_bits(file: Path, every_n: int = 1) -> Iterator[int]:
@@ -231,14 +172,3 @@ def test_equal_tensors_are_written_as_equal_files(tmp_path):
 def test_missing_file_is_an_error(tmp_path, read):
     with pytest.raises(SchemaError, match="none: file not found"):
         read(tmp_path / "none")
-
-
-def test_error_for_an_unreadable_file_does_not_say_that_it_is_damaged(tmp_path, monkeypatch):
-    (tmp_path / "a.parquet").write_bytes(b"PAR1")
-
-    def refuse(path, **_):
-        raise OSError(errno.EIO, "Input/output error", str(path))
-
-    monkeypatch.setattr(io.pq, "ParquetFile", refuse)
-    with pytest.raises(OSError, match="Input/output error"):
-        io.read_table(tmp_path / "a.parquet")

@@ -66,11 +66,6 @@ def test_command_is_refused_while_a_stage_runs(root):
         pass
 
 
-def test_command_is_refused_while_dvc_holds_its_lock_between_stages(root):
-    with Repo(str(root)) as repo, repo.lock, pytest.raises(ParamsError, match="nothing was changed"), changing(root):
-        pass
-
-
 def test_dvc_runs_no_stage_while_a_command_changes_the_checkout(root):
     with changing(root):
         done = run(root, "dvc", "repro", check=False)

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline import stage
 from reskin import io
-from reskin.errors import RETRY, MachineError, SchemaError, explaining
+from reskin.errors import RETRY, MachineError, explaining
 
 
 @pytest.mark.parametrize(
@@ -56,15 +56,6 @@ def test_error_for_a_full_disk_names_the_target(tmp_path, write):
             write(target, content, *([{}] if write is io.write_tensors else []))
     assert temporary.is_symlink()
     assert not target.exists()
-
-
-def test_damaged_table_is_an_error(tmp_path):
-    io.write_table(tmp_path / "t.parquet", pa.table({"a": np.random.default_rng(0).normal(size=9999)}))
-    content = (tmp_path / "t.parquet").read_bytes()
-    for damaged in (content[:-20], bytes(500) + content[500:], b""):
-        (tmp_path / "t.parquet").write_bytes(damaged)
-        with pytest.raises(SchemaError, match="cannot be read as a Parquet file: .*\\.dvc/cache/files.* `dvc repro`"):
-            io.read_table(tmp_path / "t.parquet")
 
 
 def test_stage_prints_the_error_and_exits(tmp_path, monkeypatch, capsys):

@@ -3,17 +3,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.catalogue import stages
 from pipeline.manage.registry import Registry
 from pipeline.plan import make_plan, read_plan
 from pipeline.scenes import Scene, parse_scene, read_scene, read_shared
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
-from tests.scenes import ADAPTATIONS, SECTIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
+from tests.scenes import ADAPTATIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
 ADAPTED = ("lobo", "triplet", "adapt")  # Adaptation, and the experiments that it needs.
-LEARNING = ("models", "curve", "study")
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
@@ -85,21 +83,6 @@ def test_missing_required_experiment_is_an_error(experiment, others):
     assert str(error.value) == message
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"train_n": 2}, "train_n and test_n must be at most every_n"),
-        ({"test_n": 2}, "train_n and test_n must be at most every_n"),
-        ({"regular_n": 5}, "regular_n is required if policies contains regular, and not allowed otherwise"),
-        ({"policies": ["regular"]}, "regular_n is required if policies contains regular, and not allowed otherwise"),
-        ({"policies": ["each", "each"]}, "policies contains a policy more than once"),
-    ],
-)
-def test_contradictory_drift_windows_are_an_error(changes, message):
-    with pytest.raises(ParamsError, match=message):
-        scene("lobo", "drift", drift=SECTIONS["drift"]["drift"] | changes)
-
-
 def test_simulated_experiment_needs_a_simulated_scene():
     with pytest.raises(ParamsError, match="only a simulated scene can run experiments sensitivity"):
         parse_scene(recorded_scene(experiments=["lobo", "sensitivity"]), "scene.yaml")
@@ -132,40 +115,7 @@ def test_scene_runs_only_the_stages_of_its_experiments_and_protocols(unit):
     assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_error_lists_all_missing_experiments():
-    with pytest.raises(ParamsError, match="experiment choice needs adapt, triplet in the same scene"):
-        scene("lobo", "choice")
-
-
 ALL = (*ADAPTED, "transfer", "pokes", "sensors", "new_board", "audit", "choice")
-
-
-def test_scene_with_all_experiments_runs_all_their_stages():
-    checked = scene(*ALL)
-    assert set(stages(checked.experiments, *LEARNING)) == {
-        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors",
-    }  # fmt: skip
-    assert checked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
-    assert checked.curves == {"pokes": "sweep_pokes", "sensors": "sweep_sensors"}
-    # These experiments have folds.
-    assert set(checked.with_folds) == {"lobo", "transfer", "sensors"}
-
-
-def test_scene_with_one_experiment_runs_only_its_stage():
-    one = scene("lobo")
-    assert (stages(one.experiments, *LEARNING), one.model_stages, one.curves) == (
-        ["train_multi"],
-        ["train_multi"],
-        {},
-    )
-
-
-@pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
-def test_scene_needs_only_the_sections_of_its_experiments(experiment):
-    section = next(iter(SECTIONS[experiment]))
-    lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
-    with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct these settings."):
-        parse_scene(lacking, "scene.yaml")
 
 
 @pytest.mark.parametrize("experiment", SPLIT_SETTINGS)
@@ -197,27 +147,11 @@ def test_invalid_experiment_setting_is_an_error(changes, message):
         scene(*ALL, **changes)
 
 
-def test_error_lists_all_missing_settings():
-    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "transfer", "sensitivity"]}
-    settings["split"] = {}
-    settings["simulate"]["protocols"].pop("glass")
-    with pytest.raises(ParamsError, match="split lacks transfer_skins_n; simulate.protocols lacks glass"):
-        parse_scene(settings, "ci.yaml")
-
-
 def test_missing_setting_is_an_error_because_settings_have_no_defaults():
     settings = recorded_scene()
     del settings["seed"]
     with pytest.raises(ParamsError, match="scene.yaml: seed is missing"):
         parse_scene(settings, "scene.yaml")
-
-
-def test_error_for_a_misspelt_parameter_names_it():
-    with pytest.raises(ParamsError, match=r"recipes.fast.rat_max is not a known parameter .its value: 4"):
-        check(recorded_scene(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
-    settings = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
-    with pytest.raises(ParamsError, match=r"train_multi: steps_n is missing .given: .*step_n"):
-        check(recorded_scene(train_multi=settings))
 
 
 def test_numbers_with_an_exponent_in_yaml_are_read_as_numbers(tmp_path):
@@ -242,10 +176,3 @@ def test_unknown_base_recipe_is_an_error():
     scene["adapt"]["base"] = "nope"
     with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
         check(scene)
-
-
-def test_adaptation_without_training_is_an_error():
-    scene = scene_with("lobo", "triplet", "adapt")
-    scene["experiments"] = ["lobo", "adapt"]
-    with pytest.raises(ParamsError, match="experiment adapt needs triplet in the same scene"):
-        parse_scene(scene, "scene.yaml")

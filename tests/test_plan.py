@@ -10,11 +10,10 @@ from pipeline.manage.new import SHIPPED, scene_text
 from pipeline.manage.registry import Entry, Registry
 from pipeline.plan import Plan, make_plan
 from pipeline.scenes import Scene, parse_scene, scene_file
-from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import SHARED as SIMULATED
-from tests.scenes import SHARED, recorded_scene, scene_with, settings
+from tests.scenes import SHARED, recorded_scene, scene_with
 from tests.stages.checkout import copy_checkout, run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,24 +66,6 @@ def test_stage_of_an_experiment_on_recordings_depends_on_their_captures():
     assert generated["stages"]["drift"] == {"two": "two"}
     assert generated["captures"] == {"one": ["c0"], "two": ["c0"]}
     assert not any(generated["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
-
-
-def test_experiment_that_chooses_settings_has_no_stage_of_its_own():
-    chosen, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in ((*ADAPTED, "choice"), ADAPTED))
-    captures = Registry(captures={"lab": {"c0": ENTRY}})
-    with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
-    assert with_choice == without
-
-
-def test_planned_scene_raises_if_the_plan_lacks_an_experiment_of_the_scene(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("pipeline").mkdir()
-    Path(PLAN).write_text("scenes: {tiny: [lobo, audit]}\n")
-    tiny = settings(scene_with("lobo", "audit"))
-    assert planned_scene(tiny).experiments == ("lobo", "audit")
-    Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
-    with pytest.raises(ParamsError, match="audit only in one of them. Try: reskin scenes use tiny"):
-        planned_scene(tiny)
 
 
 def test_each_recorded_capture_has_an_ingest_stage_of_its_own():

@@ -4,21 +4,16 @@ import re
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import PathDistribution
 from pathlib import Path
 
 import grimp
 import pytest
-from packaging.specifiers import SpecifierSet
 
 from pipeline.cli import app as checkout
-from release import constraints
-from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
-from reskin import io
 from reskin.cli import CHECKOUT_COMMANDS, add_checkout_commands
 from reskin.config import read_yaml
-from reskin.errors import ParamsError, explaining, require
+from reskin.errors import ParamsError
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -98,23 +93,6 @@ def test_library_imports_only_required_packages():
     assert done.stdout == "(1, 3)\n", done.stderr
 
 
-def test_error_for_a_missing_package_names_the_extra_that_installs_it():
-    with pytest.raises(
-        ParamsError, match=r"model.safetensors: the Python package `nowhere` is not installed.*\[pipeline\]"
-    ):
-        require("nowhere", "model.safetensors")
-    with pytest.raises(ParamsError, match=r"package `torch` is not installed.*'\.\[train\]'"), explaining("reskin"):
-        raise ModuleNotFoundError("", name="torch.nn")
-    for package, extra in (("distributed.client", "dask"), ("dask", "dask"), ("psycopg2", "team"), ("onnx", "onnx")):
-        name = package.partition(".")[0]
-        message = rf"package `{name}` is not installed.*'\.\[{extra}\]'"
-        assert extra in PROJECT["optional-dependencies"]
-        with pytest.raises(ParamsError, match=message), explaining("train_multi"):
-            raise ModuleNotFoundError("", name=package)
-    with pytest.raises(ModuleNotFoundError), explaining("reskin"):
-        raise ModuleNotFoundError("", name="pipeline.gone")
-
-
 def test_imported_packages_are_declared():
     graph = grimp.build_graph("pipeline", "reskin", include_external_packages=True, cache_dir=None)
     names = {module.partition(".")[0] for module in graph.modules}
@@ -132,32 +110,9 @@ def test_version_is_the_same_everywhere():
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
 
 
-def test_supported_versions_of_python_are_the_same_everywhere():
-    classified = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
-    (made,) = re.findall(r"for version in (.*); do", (ROOT / "tools/test_pythons.sh").read_text(encoding="utf-8"))
-    workflow = read_yaml(ROOT / ".github/workflows/test.yml")
-    assert made.split() == workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == classified
-    supported = SpecifierSet(PROJECT["requires-python"])
-    assert [f"3.{minor}" for minor in range(9, 20) if f"3.{minor}" in supported] == classified
-    (container,) = re.findall(
-        r"^FROM python:(3\.\d+)", (ROOT / "deploy/Containerfile").read_text("utf-8"), re.MULTILINE
-    )
-    assert container in classified
-
-
 def test_licences_of_all_required_packages_are_compatible():
     assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # also fails if an exception is no longer needed
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
-
-
-def test_licences_of_gpu_packages_that_torch_needs_are_ignored(tmp_path):
-    def package(name: str) -> PathDistribution:
-        folder = tmp_path / f"{name}-1.dist-info"
-        io.write_text(folder / "METADATA", f"Name: {name}\nLicense: Proprietary\n")
-        return PathDistribution(folder)
-
-    packages = {name: package(name) for name in ("nvidia-cublas", "cuda-toolkit", "other")}
-    assert incompatible(packages) == {"other": "Proprietary"}
 
 
 @pytest.mark.parametrize(
@@ -172,22 +127,6 @@ def test_licences_of_gpu_packages_that_torch_needs_are_ignored(tmp_path):
 )  # fmt: skip
 def test_licence_is_compatible_if_one_of_its_alternatives_is(licence, compatible):
     assert is_compatible(licence) is compatible
-
-
-def test_constraints_are_replaced_atomically(tmp_path, monkeypatch):
-    file, old = tmp_path / "constraints.txt", tmp_path / "old"
-    file.write_text("torch==1.0\n")
-    old.hardlink_to(file)
-    monkeypatch.setattr(sys, "argv", ["constraints", str(file)])
-    monkeypatch.setattr(constraints, "resolve", lambda python, wanted: {"torch": "2.0"})
-    constraints.main()
-    assert file.read_text().endswith("torch==2.0\n")
-    assert old.read_text() == "torch==1.0\n"
-
-
-def test_constraints_omit_reskin_and_gpu_packages():
-    lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()
-    assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
 
 
 def test_list_of_checkout_commands_is_complete():

@@ -4,11 +4,9 @@ import http.server
 import json
 import shutil
 import socket
-import sqlite3
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import mlflow
@@ -17,7 +15,6 @@ import pandas as pd
 import pytest
 
 import reskin
-from pipeline import tracking
 from pipeline.tracking import TrackingUnavailable, after_stage, publish
 from reskin import io
 from tests.live.boards import write_model
@@ -225,26 +222,3 @@ def test_broken_store_is_reported_with_its_remedy():
     with pytest.raises(TrackingUnavailable, match="move .*mlflow.db away. Then send the results: reskin publish"):
         publish("ci")
     Path("mlflow.db").unlink()
-
-
-def test_locked_store_is_reported(monkeypatch):
-    monkeypatch.setattr(tracking, "ANSWER_S", 0.1)
-    with closing(sqlite3.connect("mlflow.db")) as other:
-        other.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(TrackingUnavailable, match="database is locked"):
-            publish("ci")
-    publish("ci")
-
-
-def test_store_that_breaks_while_it_is_written_is_reported(monkeypatch):
-    publish("ci")
-    with closing(sqlite3.connect("mlflow.db")) as other:
-        other.execute("DROP TABLE tags")
-    with pytest.raises(TrackingUnavailable, match="no such table: tags.*No result is lost"):
-        publish("ci")
-
-
-def test_slow_server_is_left_and_the_rest_is_written_later(monkeypatch):
-    monkeypatch.setattr(tracking, "LIMIT_S", -tracking.LIMIT_PER_RUN_S * 5)
-    with pytest.raises(TrackingUnavailable, match="too slow"):
-        publish("ci")

@@ -1,7 +1,5 @@
 """Tests of the grid protocol against the paper's counts and the order of real recordings."""
 
-import csv
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,18 +24,6 @@ def test_places_are_visited_in_snake_order():
     assert (steps_mm[along, 0] == 2).all()
     # Larger steps occur only from one row to the next. The lengths of these rows differ by at most two places.
     assert (steps_mm[~along, 0] <= 4).all()
-
-
-def test_order_of_places_equals_that_of_lab_recordings(shared_data):
-    with (shared_data / "lab" / "board1_depth1.csv").open() as file:
-        rows = {int(row["indent"]): (float(row["x_mm"]), float(row["y_mm"])) for row in csv.DictReader(file)}
-    np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
-
-
-def test_pass_with_six_depths_has_390_indentations():
-    plan = protocol((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), 26)
-    assert len(plan) == 26 * 390
-    assert np.bincount(plan.pass_i).tolist() == [390] * 26
 
 
 @given(depths_mm, st.integers(1, 3))

@@ -6,12 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.data.grid import SKIN_MM, points_mm, protocol
-from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shift_rows, take_pokes
+from reskin.data.grid import points_mm, protocol
+from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, take_pokes
 from reskin.data.rows import Rows, Selection, gather, stack
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as make_rows
 
@@ -80,30 +79,6 @@ def test_lines_of_a_grid_equal_those_found_by_nested_loops(labels, data):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_lines_of_the_65_places_are_9_rows_and_9_columns():
-    lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
-    lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
-    # The lengths of lines along the rows of the grid, then along its columns.
-    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2
-    assert lines.line_i.max() == 17
-    # Each row of the table belongs to one row and one column of the grid.
-    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
-
-
-def test_all_indentations_at_one_place_are_on_the_same_lines():
-    table = grid(depths_n=2, passes_n=3)
-    lines = grid_lines(table, all_rows(table))
-    of_row = {row: set() for row in range(len(table))}
-    for row, line, order in zip(lines.row.tolist(), lines.line_i.tolist(), lines.order_i.tolist(), strict=True):
-        of_row[row].add((line, order))
-    by_place = {}
-    for row, (x_mm, y_mm) in enumerate(table.target[:, :2].tolist()):
-        by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
-    assert len(by_place) == 65
-    assert all(len(seen) == 1 for seen in by_place.values())
-    assert len(set.union(*by_place.values())) == 65  # Every place is on another pair of lines.
-
-
 @given(places, st.data())
 def test_lines_do_not_depend_on_the_order_of_rows(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
@@ -117,34 +92,9 @@ def test_lines_do_not_depend_on_the_order_of_rows(labels, data):
     )
 
 
-@given(places, st.lists(st.floats(0.3, 5), min_size=10, max_size=10), st.floats(-20, 20))
-def test_lines_do_not_depend_on_the_distances_between_places(labels, gaps_mm, origin_mm):
-    skins = [skin for skin, _, _ in labels]
-    along_mm = origin_mm + np.cumsum(gaps_mm)
-    plain = rows_at([(x, y) for _, x, y in labels], skins)
-    warped = rows_at([(along_mm[x], along_mm[5 + y]) for _, x, y in labels], skins)
-    rng = rng_for(0, "other recording")
-    warped.target[:, 2] = rng.normal(size=len(labels))
-    warped = replace(warped, db_uT=rng.normal(size=plain.db_uT.shape).astype(np.float32))
-    one, other = grid_lines(plain, all_rows(plain)), grid_lines(warped, all_rows(warped))
-    for field in fields(Lines):
-        assert (getattr(one, field.name) == getattr(other, field.name)).all()
-
-
 def test_places_that_differ_only_by_rounding_count_as_one_place():
     lines = grid_lines(rows_at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
-
-
-def test_missing_place_leaves_a_gap_in_the_indices_along_a_line():
-    lines = grid_lines(rows_at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
-    assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
-    assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
-
-
-def test_a_single_place_forms_no_line():
-    assert len(grid_lines(rows_at([(1, 1)] * 3), np.arange(3))) == 0
-    assert len(grid_lines(rows_at([(1, 1)]), np.zeros(0, np.int64))) == 0
 
 
 @pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
@@ -171,19 +121,6 @@ def test_lines_of_hand_pokes_equal_those_found_by_nested_loops(pokes):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_simulated_hand_pokes_are_indexed_from_0():
-    hand = Hand(
-        boards="rigid", skins_n=1, terms=(), kind="hand", lines_n=3, pokes_per_line_n=4, depth_mm=(0.5, 1.0),
-        place_sd_mm=0.3, tilt_sd_deg=5.0,
-    )  # fmt: skip
-    pass_i = hand.plan(rng_for(0, "hand"), SKIN_MM).pass_i
-    readings = np.repeat(np.arange(12, dtype=np.int32), READINGS_N)
-    lines = hand_lines(pass_i[readings], readings)
-    assert lines.row.tolist() == list(range(24))
-    assert lines.line_i.tolist() == [0] * 8 + [1] * 8 + [2] * 8
-    assert lines.order_i.tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 3
-
-
 @given(st.integers(0, 6 * 65), st.integers(0, 2**32))
 def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
@@ -194,15 +131,6 @@ def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     counts = Counter(map(tuple, table.target[chosen, :2].tolist()))
     visits_n = [counts[tuple(place_mm)] // READINGS_N for place_mm in points_mm().tolist()]
     assert max(visits_n) - min(visits_n) <= 1
-
-
-@given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
-def test_smaller_choice_is_a_subset_of_a_larger_one(one_n, other_n, seed):
-    table = grid(depths_n=3, passes_n=2)
-    smaller, larger = (
-        set(take_pokes(table, all_rows(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
-    )
-    assert smaller <= larger
 
 
 @given(st.integers(0, 2**32))
@@ -276,18 +204,6 @@ def test_hand_pokes_have_fields_but_no_labels():
     assert np.isnan(rows.target).all()
     assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5] * 2
     assert len({*rows.indentation}) == 6
-
-
-def test_lines_of_a_skin_contain_only_its_rows():
-    captures = [hand_readings("s0"), hand_readings("s1")]
-    rows, lines = hand_rows(captures)
-    for one in captures:
-        alone = hand_lines(one.pass_i, one.indentation)
-        assert lines[one.skin].order_i.tolist() == alone.order_i.tolist() == [0, 0, 1, 1, 2, 2]
-        assert set(rows.skin[lines[one.skin].row]) == {one.skin}
-    above = gather([readings("c0", f=4)], ALL_READINGS)
-    below = shift_rows(lines["s1"], len(above))
-    assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
 def test_stacking_raises_if_channels_differ_or_a_skin_occurs_twice():

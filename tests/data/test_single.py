@@ -49,25 +49,6 @@ def test_readings_of_one_indentation_or_pass_are_all_for_training_or_all_for_tes
         assert len(fold.pool) == 0
 
 
-@pytest.mark.parametrize("experiment", UNSPLIT_BY)
-@given(order=st.permutations(range(24)))
-def test_split_into_training_and_test_rows_does_not_depend_on_the_order_of_rows(experiment, order):
-    table = make_passes(3, 4, skins_n=1)
-    order = np.array(order)
-    shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
-    split = Split(random_test_fraction=0.3, random_repeats_n=2)
-    group = UNSPLIT_BY[experiment]
-    for one, other in zip(*(draw_folds(t, [experiment], split, 3) for t in (table, shuffled)), strict=True):
-        assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
-
-
-def test_split_of_the_paper_puts_readings_of_one_indentation_into_training_and_test_rows():
-    table = make_passes(4, 10, readings_n=5)
-    (fold,) = draw_folds(table, ["single_random"], Split(random_test_fraction=0.1, random_repeats_n=1), 0)
-    shared = {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
-    assert len(shared) > len(fold.test) / 2
-
-
 @given(st.integers(2, 200), st.floats(0.01, 0.9), st.integers(0, 2**32 - 1))
 def test_split_of_single_readings_equals_scikit_learn(rows_n, fraction, state):
     test_n = max(1, round(fraction * rows_n))

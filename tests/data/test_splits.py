@@ -13,9 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.config import parse
 from reskin.data import splits
-from reskin.data.splits import Split, draw_folds, from_ranges, parse_folds, render_folds, to_ranges
+from reskin.data.splits import Split, draw_folds, parse_folds, render_folds
 from reskin.errors import ParamsError, SchemaError
 from tests.data.tables import rows
 
@@ -43,13 +42,6 @@ def test_every_row_is_held_out_in_exactly_one_fold(pairs):
         assert sorted([*fold.train, *fold.test]) == list(range(len(table)))
         for names in (table.board, table.skin):
             assert not set(names[fold.train]) & set(names[fold.test])
-
-
-def test_six_boards_have_six_folds():
-    table = six_by_three()
-    folds = draw_folds(table, ["lobo"], Split(), 0)
-    assert [fold.name for fold in folds] == [f"b{i}" for i in range(6)]
-    assert all(len(set(table.skin[fold.test])) == 3 for fold in folds)
 
 
 @given(st.permutations(range(18)))
@@ -93,12 +85,6 @@ def test_experiment_single_temporal_tests_the_last_passes(passes_n):
     assert len(fold.train) + len(fold.test) == len(table)
 
 
-def test_experiment_single_temporal_tests_the_last_ten_of_fifty_passes():
-    table = rows(["b0"] * 50, ["s0"] * 50, list(range(50)))
-    (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
-    assert (len(fold.train), len(fold.test)) == (40, 10)
-
-
 def six_by_three_in_passes(passes_n: int, readings_n: int = 2):
     labels = [
         (f"b{board}", f"b{board}_s{skin}", pass_i)
@@ -120,40 +106,6 @@ def test_pool_consists_of_the_first_passes_of_held_out_skins(experiment, split):
         assert fold.pool.tolist() == [i for i in held if table.pass_i[i] in (0, 1)]
         assert fold.test.tolist() == [i for i in held if table.pass_i[i] not in (0, 1)]
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
-
-
-@pytest.mark.parametrize("experiment", ["lobo", "sensors"])
-@given(order=st.permutations(range(12)))
-def test_pool_and_chosen_skins_do_not_depend_on_the_order_of_rows(experiment, order):
-    labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
-    # The two passes have the numbers 3 and 5.
-    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)
-    original, shuffled = (
-        rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
-        for numbers in (range(12), order)
-    )
-    expected, actual = (draw_folds(table, [experiment], split, 7) for table in (original, shuffled))
-    for one, other in zip(expected, actual, strict=True):
-        assert one.name == other.name
-        for side in ("train", "test", "pool"):
-            assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
-
-
-def test_all_held_out_rows_are_test_rows_if_there_is_no_pool():
-    table = six_by_three_in_passes(2)
-    for experiment in ("lobo", "sensors"):
-        for fold in draw_folds(table, [experiment], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
-            assert len(fold.pool) == 0
-            assert fold.test.tolist() == np.flatnonzero(table.board == table.board[fold.test[0]]).tolist()
-
-
-@pytest.mark.parametrize(("experiment", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
-def test_folds_of_experiments_without_adaptation_have_no_pool(experiment, split):
-    table = six_by_three_in_passes(5)
-    pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
-    for fold, plain in zip(pooled, draw_folds(table, [experiment], split, 0), strict=True):
-        assert len(fold.pool) == 0
-        assert fold.test.tolist() == plain.test.tolist()
 
 
 @given(st.integers(0, 2**32))
@@ -186,16 +138,6 @@ def test_fold_with_all_sensors_equals_the_leave_one_board_out_fold():
             np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
 
 
-def test_skins_for_training_do_not_depend_on_the_number_of_draws():
-    table = six_by_three_in_passes(1)
-    few, many = (
-        draw_folds(table, ["sensors"], Split(sensors_skins_n=(6,), sensors_draws_n=draws_n), 0) for draws_n in (2, 5)
-    )
-    first = [fold for fold in many if fold.name.startswith("b0")]
-    assert len({tuple(fold.train) for fold in first}) == 5
-    assert [fold.train.tolist() for fold in few[:2]] == [fold.train.tolist() for fold in first[:2]]
-
-
 def test_skins_for_training_are_drawn_independently_for_each_held_out_board():
     table = six_by_three_in_passes(1)
     folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
@@ -204,11 +146,6 @@ def test_skins_for_training_are_drawn_independently_for_each_held_out_board():
         for fold in folds
     }
     assert len(ranks) > 1  # The three skins that are drawn are not the same on all boards.
-
-
-def test_numbers_of_skins_that_are_listed_twice_raise_an_error():
-    with pytest.raises(ParamsError, match="must list each number of skins only once"):
-        parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
 ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
@@ -248,12 +185,6 @@ def test_draw_folds_raises_if_a_skin_is_on_two_boards(experiment, split):
 TABLE = rows(["b0", "b0", "b1", "b2"], ["s0", "s0", "s1", "s2"])
 
 
-@given(st.sets(st.integers(0, 200)))
-def test_row_numbers_saved_as_ranges_are_read_unchanged(numbers):
-    sorted_numbers = np.array(sorted(numbers), np.int64)
-    assert from_ranges(to_ranges(sorted_numbers)).tolist() == sorted_numbers.tolist()
-
-
 PASSES = rows(["b0"] * 3 + ["b1"] * 2, ["s0"] * 3 + ["s1"] * 2, [0, 1, 2, 0, 1])
 
 
@@ -265,18 +196,6 @@ def test_saved_folds_are_read_unchanged(table, split):
     folds = draw_folds(table, ["lobo"], split, 0)
     document = json.loads(json.dumps(render_folds(["c0"], table, folds)))
     assert listed(parse_folds(document, table, "folds.json")) == listed(folds)
-
-
-def test_saved_folds_list_boards_and_skins():
-    document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
-    assert document["folds"][0]["test_boards"] == ["b0"]
-    assert document["folds"][0]["train_skins"] == ["s1", "s2"]
-    assert document["folds"][0]["pool_skins"] == []
-    document = render_folds(["c0"], PASSES, draw_folds(PASSES, ["lobo"], Split(pool_passes_n=1), 0))
-    assert [(one["pool_boards"], one["pool_skins"]) for one in document["folds"]] == [
-        (["b0"], ["s0"]),
-        (["b1"], ["s1"]),
-    ]
 
 
 def test_parse_folds_raises_if_folds_were_saved_for_other_rows():

@@ -15,24 +15,18 @@ from pipeline.experiments.accuracy_and_cost import (
     SOLVERS,
     TERMS,
     WARMER_K,
-    Failed,
     Integrators,
     Quadratures,
     draw_trial,
-    error_of,
-    figures,
     gauss_nodes,
     hereditary,
-    integrate,
     magpylib_change,
-    median_s,
     midpoints,
     neglected_terms,
-    stiff,
     study_field,
     study_relaxation,
 )
-from reskin.physics.aging import SKIN_RELAXATION, Prony, relaxed_share, softening
+from reskin.physics.aging import Prony, relaxed_share, softening
 from reskin.physics.magnet import SKIN_SIDE_M, Quadrature, change_of_field
 from tests.simulation.scene import GRID, synthesis, with_protocol
 
@@ -115,21 +109,6 @@ def test_exact_update_is_the_only_method_that_is_exact_at_every_stiffness():
     assert all(tight[key] <= loose[key] for key in both)
 
 
-def test_integrator_that_needs_too_many_evaluations_has_failed():
-    with pytest.raises(Failed):
-        integrate(stiff(1e8), "RK45", 1e-6, 100)
-    assert error_of(lambda: integrate(stiff(1e8), "RK45", 1e-6, 100), np.ones(3)) is None
-    assert error_of(lambda: np.full(3, np.nan), np.ones(3)) is None
-
-
-@given(st.floats(10, 1e12))
-def test_stiffness_changes_only_the_ratio_of_relaxation_times(ratio):
-    prony = stiff(ratio)
-    assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
-    assert prony.tau_s.max() == SKIN_RELAXATION.tau_s.max()
-    np.testing.assert_array_equal(prony.share, SKIN_RELAXATION.share)
-
-
 def test_hereditary_integral_equals_numerical_integration():
     prony = Prony(np.array([0.3, 5.0]), np.array([0.2, 0.3]))
     time_s, elastic = np.array([0.0, 0.5, 2.0]), np.array([0.0, 1.0, 0.4])
@@ -143,12 +122,6 @@ def test_hereditary_integral_equals_numerical_integration():
         for of, first, last in zip(slope, time_s[:-1], time_s[1:], strict=True)
     )
     assert hereditary(time_s, elastic, prony)[-1] == pytest.approx(truth, rel=1e-10)
-
-
-def test_median_time_is_that_of_the_call(monkeypatch):
-    now_s = iter([0.0, 1.0, 5.0, 8.0, 10.0, 12.0])
-    monkeypatch.setattr(accuracy_and_cost, "perf_counter", lambda: next(now_s))
-    assert median_s(lambda: None, 3) == 2.0
 
 
 @pytest.fixture(scope="module")
@@ -168,22 +141,3 @@ def test_force_errors_of_neglected_ageing_and_relaxation_equal_closed_forms(term
 
 def test_neglecting_one_kelvin_changes_the_field_by_0_12_percent(terms):
     assert terms["temperature", f"% of dB at {WARMER_K:g} K"].error == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
-
-
-def test_terms_that_the_main_protocol_simulates_are_marked(terms):
-    assert {row.setting for row in terms.values()} == {"neglected"}
-    aged = {"terms": ["memory"]} | {"skins_n": 1}
-    scene = with_protocol("grid", FEW | aged, terms={"memory": TERMS["memory"].memory.model_dump()})
-    assert {row.method for row in neglected_terms(scene, 1) if row.setting == "simulated"} == {"memory"}
-
-
-def test_figure_shows_only_methods_with_run_times():
-    rows = [
-        {"study": "training", "method": "network", "setting": f"{n} steps", "error": 1 / n, "unit": "mm²"}
-        for n in (1, 2)
-    ]
-    assert figures({"rows": rows}, {}, "simulated") == {}
-    timed = [row | {"seconds": 0.1 * i + 0.1} for i, row in enumerate(rows)]
-    (drawing,) = figures({"rows": timed}, {}, "simulated").values()
-    assert "training" in drawing
-    assert "run time / ms" in drawing

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from pipeline.experiments import audit as experiment
-from pipeline.experiments.audit import AuditSettings, Check, audit, check_fold, check_scaler, nearest_rays
+from pipeline.experiments.audit import AuditSettings, Check, audit, check_fold
 from pipeline.settings import Adaptations, Settings, Training
 from pipeline.training import jobs as _training
 from pipeline.training.jobs import SceneData, adaptation_jobs, make_jobs, read_data, read_pretrained, write_models
@@ -238,15 +238,6 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
     assert_leak(scene, f"all folds, {sentence}")
 
 
-def test_recipes_that_differ_from_the_chosen_ones_are_listed(scene):
-    chosen = {"train_multi": CHOSEN["train_multi"], "adapt": CHOSEN["adapt"] | {"rate_max": 3e-3}}
-    io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
-    found = {check["where"]: check["found"] for check in run_audit(scene) if check["what"] == "settings: recipe"}
-    assert found["train_multi"] == found["train_single"] == "equal"
-    assert found["adapt"] == "not chosen by the study: rate_max 0.001 (study: 0.003)"
-    assert found["train_triplet"] == "not chosen by the study"
-
-
 # --- Copies ---
 
 
@@ -314,17 +305,6 @@ def test_weak_skins_are_named_until_the_scene_accepts_them():
     assert failing(checks_of(weak_uT, weak_skins=("b0_s1",))) == ["copies"]
 
 
-def test_nearest_field_is_the_one_with_the_most_similar_direction(monkeypatch):
-    monkeypatch.setattr(experiment, "CHUNK_PAIRS_N", 100)  # so that the pairs are processed in several chunks
-    rng = rng_for(2, "rays")
-    rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
-    for row, i, off in zip(rows.astype(float), *nearest_rays(rows, others), strict=True):
-        angles = [np.arccos(row @ o / np.linalg.norm(row) / np.linalg.norm(o)) for o in others.astype(float)]
-        assert i == np.argmin(angles)
-        # The relative tolerance allows for rays in single precision.
-        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)
-
-
 def test_lab_recordings_pass_but_a_copy_that_is_planted_in_them_is_detected(shared_data):
     tables, channels = [], [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
     for board in ("board1", "board2"):
@@ -355,15 +335,3 @@ def test_indentation_that_is_split_between_training_and_test_is_detected(name):
         list(check_fold(data, replace(split, test=NONE), section))
     with pytest.raises(ParamsError, match="must be one of"):
         list(check_fold(data, replace(split, experiment="unknown"), section))
-
-
-@pytest.mark.parametrize("scaling", list(FIT))
-def test_scaler_is_distinguished_from_one_with_one_more_row_among_100000(scaling):
-    rng = rng_for(3, "scaler")
-    db_uT, target = np.tile(ROWS.db_uT, (260, 1)), rng.uniform(0.1, 16, (260 * 384, 3)).astype(np.float32)
-    order = rng.permutation(len(db_uT) - 1)
-    all_but_one = FIT[scaling](db_uT[:-1], target[:-1]).arrays()
-    assert check_scaler("m", FIT[scaling](db_uT[:-1][order], target[:-1][order]).arrays(), all_but_one).holds
-    assert not check_scaler("m", FIT[scaling](db_uT, target).arrays(), all_but_one).holds
-    assert not check_scaler("m", all_but_one | {"target_shift": np.full(3, np.nan, np.float32)}, all_but_one).holds
-    assert not check_scaler("m", {}, all_but_one).holds

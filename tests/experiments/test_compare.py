@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.experiments.compare import agreement, compare_boards, figures
+from pipeline.experiments.compare import agreement, compare_boards
 from pipeline.fitting.law_fit import TEN, fit
 from pipeline.fitting.presses import RecordedPresses, pool, thin
-from pipeline.report.tables import compare
 from reskin.recordings.readers import lab
 from reskin.universal.law import simulate_uT
 from tests.fitting.recorded import AXES, SETUP, TRUE, simulated_presses
 from tests.recordings.test_recordings import LAB, ingest
-from tests.report.synthetic import texts_of
 from tests.sizes import FULL
 
 
@@ -41,16 +39,6 @@ def test_orientation_is_checked_on_every_board(compared):
     for found in numbers["by_board"].values():
         assert found["frames"]["sentence"] == "Labels, chips and skin are oriented as layout reskin states."
         assert all(chip["cosine_best"] == chip["cosine_as_written"] > 0.5 for chip in found["frames"]["chips"])
-
-
-def test_table_and_figure_show_every_board(compared):
-    numbers, drawn = compared
-    table = compare({"compare": numbers})
-    assert table["board"].tolist() == ["b1"] * 3 + ["b2"] * 3 + ["b3"]
-    texts = texts_of(figures(numbers, drawn, "recorded")["compare_growth.svg"])
-    assert "b2" in texts
-    assert f"recorded: power {numbers['by_board']['b1']['growth']['recorded']:.2f}" in texts
-    assert figures(numbers, {"boards": {}}, "recorded") == {}
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from scipy.stats import linregress, sem
 
 from pipeline.experiments import drift as experiment
-from pipeline.experiments.drift import Drift, claims, cut, drift, figures, force_left_pct, run, summarise
+from pipeline.experiments.drift import Drift, cut, drift, figures, force_left_pct, run, summarise
 from pipeline.report import tables
 from pipeline.scores import make_table, read_scores
 from pipeline.settings import Settings, read_shared_files
@@ -165,17 +165,6 @@ def test_scores_equal_those_of_a_loop_over_networks_and_windows(results):
     assert len(found.scores) == 2 * 3 * 2 * 3
 
 
-def test_windows_have_means_and_standard_deviations_over_skins_and_seeds(results):
-    found = results[0]
-    for policy in ("initial", "regular", "each"):
-        for window_i, window in enumerate(summarise(found.scores, found.measured)[policy]):
-            rows = found.scores[(found.scores["method"] == policy) & (found.scores["window_i"] == window_i)]
-            assert window["contacts_n"] == 100 * (window_i + 1)
-            for name in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "bias_f_N"):
-                assert window[name] == pytest.approx(np.mean(rows[name]))
-                assert window["spread"][name] == pytest.approx(np.std(rows[name], ddof=1))
-
-
 def test_late_bias_and_its_standard_error_over_indentations_equal_scipy(results):
     found, data, jobs = results
     late = summarise(found.scores, found.measured)["late"]
@@ -221,33 +210,6 @@ def errors(**lines: tuple[float, float]) -> pd.DataFrame:
     )  # fmt: skip
 
 
-PAPERS = {"initial": (1.0, 1.0), "regular": (0.2, 0.02), "each": (0.3, 0.02)}
-
-
-def test_claims_are_supported_by_errors_like_those_of_the_paper():
-    found = claims(errors(**PAPERS), None)
-    for name in ("higher", "faster", "each_is_worse"):
-        assert found[name]["mse_xy_mm2"].ci95[0] > 0
-    assert found["faster"]["mse_xy_mm2"].mean == pytest.approx(0.98 * 1.015)  # mean over boards
-    assert found["lasting"]["contacts_n"] == 20_000
-    assert found["lasting"]["accuracy_pct"].mean == pytest.approx(96.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "changed"),
-    [("higher", {"initial": (0.1, 0.0)}), ("faster", {"initial": (1.0, 0.0)}), ("each_is_worse", {"each": (0.1, 0.0)})],
-)
-def test_claim_is_contradicted_by_the_opposite_errors(name, changed):
-    assert claims(errors(**(PAPERS | changed)), None)[name]["mse_xy_mm2"].ci95[1] < 0
-
-
-def test_claims_are_not_judged_on_one_board_and_need_their_policies():
-    one_board = errors(**PAPERS)
-    assert claims(one_board[one_board["board"] == "b0"], None)["higher"]["mse_xy_mm2"].ci95 is None
-    assert set(claims(errors(initial=(1, 1)), None)) == set()
-    assert set(claims(errors(initial=(1, 1), each=(1, 0)), None)) == {"higher", "faster", "lasting"}
-
-
 # --- Measured on the captures ---
 
 
@@ -265,11 +227,6 @@ def test_remaining_force_compares_readings_at_equal_places_and_depths(left, orde
     # The tolerance is rounding, because forces are in single precision.
     late = readings_at(late_mm, [2 * left, left, left, 9.0, 9.0])
     assert force_left_pct(early, late) == pytest.approx(100 * left, rel=1e-6)
-
-
-@pytest.mark.parametrize("depth_mm", [2, np.nan])
-def test_remaining_force_is_unknown_if_no_place_is_visited_twice(depth_mm):
-    assert np.isnan(force_left_pct(readings_at([[0, 0, depth_mm]], [1]), readings_at([[0, 0, 1]], [1])))
 
 
 # --- Run ---

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
-from pipeline.experiments import flexible, manual, shear
-from pipeline.experiments.flexible import DRAWN_N, draw_forces, sizes_by_depth, strength_ratio
+from pipeline.experiments import shear
+from pipeline.experiments.flexible import sizes_by_depth, strength_ratio
 from pipeline.experiments.manual import GRID
-from pipeline.scores import by_skin, join, make_table, rows_of_cards, select
+from pipeline.scores import by_skin, make_table, rows_of_cards, select
 from pipeline.statistics import Stat, paired
 from pipeline.training.variants import (
     AFTER,
@@ -101,36 +101,6 @@ def test_differences_between_variants_are_paired_by_seed():
     assert result.sd_seeds == pytest.approx(np.mean([one.std(ddof=1) for one in differences]))
 
 
-def test_scores_of_one_network_have_no_standard_deviation_over_seeds():
-    first = select(TABLE, seed=0)
-    assert summarise_variants(first)[AFTER]["accuracy_pct"].sd_seeds is None
-    assert compare_variants(first, AFTER, BEFORE)["accuracy_pct"].sd_seeds is None
-    assert manual.summarise(TABLE, {})["after"]["accuracy_pct"].sd_seeds is not None
-    assert flexible.summarise(TABLE.assign(recipe="paper"), {})["bias_f_N"][AFTER].sd_seeds is not None
-
-
-def test_summary_of_hand_pokes_has_counts_and_differences():
-    summary = manual.summarise(TABLE, {"pokes_n": 325})
-    counts = ("pokes_n", "skins_n", "boards_n", "seeds_n")
-    assert {name: summary[name] for name in counts} == dict(zip(counts, (325, 3, 2, 2), strict=True))
-    for other in (BEFORE, CONTROL, GRID):
-        difference = summary["paired"][f"after_minus_{other}"]["accuracy_pct"].mean
-        after, before = (summary[variant]["accuracy_pct"].mean for variant in (AFTER, other))
-        assert difference == pytest.approx(after - before)
-
-
-def test_summary_has_no_difference_from_the_control_if_there_is_no_control():
-    summary = manual.summarise(TABLE[TABLE["method"] != CONTROL], {})
-    assert CONTROL not in summary
-    assert "after_minus_control" not in summary["paired"]
-
-
-def test_recipes_of_experiment_flexible_are_summarised_separately():
-    summary = flexible.summarise(join([TABLE.assign(recipe="paper"), TABLE.assign(recipe="shape")]), {})
-    assert set(summary["bias_f_N"]) == {BEFORE, AFTER, CONTROL, GRID} < set(summary)
-    assert summary["shape"].items() <= summary.items()
-
-
 @given(st.floats(0.5, 3))
 def test_strength_ratio_equals_the_factor_between_two_sets_of_field_changes(ratio):
     rng = rng_for(1, "fields")
@@ -145,21 +115,6 @@ def test_strength_ratio_equals_the_factor_between_two_sets_of_field_changes(rati
     assert result.mean == pytest.approx(ratio, rel=SINGLE)
     assert result.sd == pytest.approx(0, abs=SINGLE)
     assert result.n == 3
-
-
-def test_strength_ratio_ignores_depths_that_only_one_variant_has():
-    one, other = ({d: np.array([float(i + d)]) for d in depths} for i, depths in ((1, (0.2, 0.4)), (3, (0.4, 0.6))))
-    assert strength_ratio([one], [other]) == Stat(pytest.approx(1.4 / 3.4), 1)
-
-
-def test_figure_shows_the_same_random_readings_of_both_variants():
-    many = [
-        VariantPrediction(variant, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for variant in (BEFORE, AFTER)
-    ]
-    plotted = draw_forces(many, rng_for(0, "drawn"))
-    assert plotted[BEFORE]["true_N"] == plotted[AFTER]["true_N"] == plotted[AFTER]["predicted_N"]
-    assert len(plotted[BEFORE]["true_N"]) == DRAWN_N
-    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(plotted[BEFORE]["true_N"])
 
 
 def make_drag(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
@@ -178,23 +133,6 @@ def test_errors_of_five_targets_equal_those_of_scikit_learn(seed):
     assert ours["explained_fz"] == pytest.approx(r2_score(true[:, 4], predicted[:, 4]), rel=rel, abs=1e-6)
     near = [abs(p[0] - t[0]) <= 1 and abs(p[1] - t[1]) <= 1 for t, p in zip(true, predicted, strict=True)]
     assert ours["accuracy_pct"] == pytest.approx(100 * sum(near) / len(near))
-
-
-@given(st.integers(0, 1000), st.floats(0.1, 10))
-def test_explained_variance_does_not_depend_on_the_unit(seed, size):
-    true, predicted = make_drag(seed)
-    scale = np.array([1, 1, size, size, size])
-    one, other = score_shear(true, predicted), score_shear(true * scale, predicted * scale)
-    assert other["mse_fxy_N2"] == pytest.approx(size**2 * one["mse_fxy_N2"], rel=1e-4)
-    assert other["explained_fxy"] == pytest.approx(one["explained_fxy"], rel=1e-4, abs=1e-5)
-    assert other["mse_xy_mm2"] == pytest.approx(one["mse_xy_mm2"])
-
-
-def test_explained_variance_is_1_for_exact_predictions_and_0_for_the_mean():
-    true, _ = make_drag(0)
-    assert score_shear(true, true)["explained_fxy"] == 1
-    mean = np.broadcast_to(true.mean(axis=0, dtype=np.float64), true.shape)
-    assert score_shear(true, mean)["explained_xy"] == pytest.approx(0, abs=1e-6)
 
 
 def test_scores_of_shear_are_averaged_over_seeds_before_folds():

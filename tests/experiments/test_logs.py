@@ -9,17 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.logs import (
-    PERIOD_S,
     PITCHES_DEG,
     Log,
     earth_in_board_T,
-    figures,
     score_pitches,
-    step_period_s,
-    swing,
 )
 from reskin.errors import CaptureError
-from reskin.logs import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
+from reskin.logs import contacts_n, describe, estimate, quiet_start, score_contacts, truth_at
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, Instrument
 from reskin.physics.board import Board
 from reskin.seeds import rng_for
@@ -71,15 +67,6 @@ def test_log_that_begins_with_a_contact_is_refused():
         quiet_start(t_s[:40], b_uT[:40], where="log")
 
 
-def test_log_without_steps_has_no_contact():
-    t_s, b_uT, _ = make_log(5.0, steps_n=0)
-    found = estimate(t_s, b_uT, [predict], where="log")
-    assert found.quiet_n >= 0.9 * len(t_s)
-    numbers = describe(found)
-    assert numbers["contacts_n"] == 0
-    assert "force_max_N" not in numbers
-
-
 def test_number_of_contacts_forces_and_noise_are_recovered():
     t_s, b_uT, force_N = make_log()
     found = estimate(t_s, b_uT, [predict], where="log")
@@ -112,37 +99,10 @@ def test_score_is_the_mean_score_of_networks_and_not_that_of_their_mean_predicti
     assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
 
-def test_plotted_series_has_the_first_network_and_the_range_over_all_networks():
-    t_s, b_uT, force_N = make_log(steps_n=40)
-    networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
-    plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
-    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in plotted[which]["x_mm"] if x_mm is not None)
-                               for which in ("low", "estimated", "high")}  # fmt: skip
-    assert "low" not in thin(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
-
-
-@given(st.lists(st.booleans(), max_size=40))
-def test_contacts_and_gaps_of_a_single_reading_are_ignored(contact):
-    closed = [now or (0 < i < len(contact) - 1 and contact[i - 1] and contact[i + 1]) for i, now in enumerate(contact)]
-    runs = "".join("x" if now else " " for now in closed).split()
-    assert contacts_n(np.array(contact, bool)) == sum(len(run) > 1 for run in runs)
-
-
 def test_true_values_of_a_reading_are_those_of_the_step_at_its_time():
     true = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     found = truth_at(np.array([0.0, 1.5, 2.5, 3.5, 9.0]), np.array([1.0, 3.0]), np.array([2.0, 4.0]), true)
     np.testing.assert_array_equal(found, [[np.nan] * 3, true[0], [np.nan] * 3, true[1], [np.nan] * 3])
-
-
-def test_plotted_series_has_fewer_points_and_no_values_without_contact():
-    t_s, b_uT, force_N = make_log(steps_n=40)
-    plotted = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
-    assert len(plotted["t_s"]) <= 1500
-    assert plotted["t_s"][0] == pytest.approx(0.004)
-    for which in ("estimated", "true"):
-        assert plotted[which]["F_N"][0] is None
-        assert None in plotted[which]["x_mm"]
-        assert 8.0 in plotted[which]["x_mm"]
 
 
 def plain_board(name, chips_n):
@@ -179,18 +139,6 @@ def test_length_of_the_change_of_the_earth_field_equals_the_chord_of_the_rotatio
     assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)
 
 
-def test_pitch_is_zero_at_the_start_and_then_oscillates():
-    t_s = np.array([0.0, 1.0, 1.125, 1.25, 1.375, 1.5])
-    np.testing.assert_allclose(swing(t_s, start_s=1.0, period_s=0.5), [0, 0, 1, 0, -1, 0], atol=1e-12)
-
-
-def test_step_period_is_the_median_time_between_the_starts_of_contacts():
-    t_s = np.arange(12) / 10
-    assert step_period_s(t_s, np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1, 1], bool)) == pytest.approx(0.45)
-    assert step_period_s(t_s, np.arange(12) == 3) == PERIOD_S
-    assert step_period_s(t_s, np.zeros(12, bool)) == PERIOD_S
-
-
 def test_scores_at_pitch_zero_equal_the_scores_of_the_log():
     log, rows = pitched_log()
     found = estimate(log.t_s, log.b_uT, [predict], where="log")
@@ -221,20 +169,3 @@ def test_noise_of_the_reference_chip_increases_the_force_error():
     rows = pitched_log(noise_uT=3.0)[1]
     assert all(row["reference_chip"]["mse_f_N2"] > 1.5 * rows[0]["mse_f_N2"] for row in rows)
     assert all(row["reference_chip"]["contacts_n"] == 4 for row in rows)
-
-
-NUMBERS = {"rate_hz": 250.0, "networks_n": 3}
-SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
-
-
-def test_figure_names_the_number_of_networks():
-    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
-    assert "range over 3 network seeds" in figures(NUMBERS, plotted, "simulated")["logs.svg"]
-
-
-def test_figure_shows_true_values_if_they_are_known():
-    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
-    assert ">true<" not in figures(NUMBERS, plotted, "recorded")["logs.svg"]
-    both = figures(NUMBERS, plotted | {"true": SERIES}, "simulated")["logs.svg"]
-    assert ">true<" in both
-    assert "(simulated)" in both

@@ -1,11 +1,10 @@
 """Tests of the result files of experiments: numbers, data of figures, and how many rows each capture lost."""
 
-import json
 from pathlib import Path
 
 import pytest
 
-from pipeline.experiments.results import only, read_losses, write_results
+from pipeline.experiments.results import only, read_losses
 from reskin import io
 from reskin.errors import SchemaError
 from tests.data import tables
@@ -19,17 +18,6 @@ def test_results_list_the_lost_rows_of_each_capture(tmp_path):
     assert [account["bytes_n"] for account in losses["accounts"]] == [82, 164]
     assert [account["skipped_resync_bytes_n"] for account in losses["accounts"]] == [0, 1]
     assert losses["left_out"] == {"low_force_rows_n": 3}
-
-
-def test_results_contain_no_losses_if_an_experiment_uses_the_main_captures(tmp_path):
-    write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
-    written = json.loads((tmp_path / "contacts.json").read_text())
-    assert written["losses"] == {"accounts": [], "left_out": {}}
-    assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
-
-
-def test_capture_is_returned_if_there_is_exactly_one():
-    assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
 
 
 @pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])

@@ -12,7 +12,6 @@ from sklearn.metrics import mean_squared_error
 
 from pipeline.experiments.sleeve import (
     NEAR_MM,
-    draw_errors,
     errors_mm,
     hold_out_last,
     lay_out,
@@ -22,7 +21,6 @@ from pipeline.experiments.sleeve import (
 )
 from pipeline.scores import make_table
 from reskin.data.rows import Rows
-from reskin.errors import ParamsError
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
@@ -69,10 +67,6 @@ def test_borders_and_chips_of_two_by_four_boards_are_at_the_designed_places():
     np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
 
 
-def test_single_board_has_no_border():
-    assert lay_out((20.0, 20.0), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0).borders_mm == ((), ())
-
-
 @given(st.floats(0, 50.8), st.floats(0, 101.6))
 def test_place_is_near_a_border_if_any_border_is_near(x_mm, y_mm):
     to_border_mm = min(abs(x_mm - 25.4), *(abs(y_mm - border_mm) for border_mm in AREA.borders_mm[1]))
@@ -90,12 +84,6 @@ def test_last_indentations_of_each_capture_are_held_out(pokes_n, test_fraction):
         assert len(last) == round(test_fraction * n)
 
 
-@pytest.mark.parametrize("test_fraction", [0.05, 0.99])
-def test_split_without_training_or_test_rows_is_refused(test_fraction):
-    with pytest.raises(ParamsError, match="would be held out, but training and test need"):
-        hold_out_last(rows_of(9), test_fraction)
-
-
 @given(st.floats(10, 400), st.floats(0, 1e3))
 def test_frame_rate_is_measured_within_indentations(rate, pause_s):
     t_s = np.concatenate([np.arange(5), 5 + rate * pause_s + np.arange(5)]) / rate
@@ -103,11 +91,6 @@ def test_frame_rate_is_measured_within_indentations(rate, pause_s):
     found_hz = rate_hz([readings_of(t_s, [0] * 5 + [1] * 5, reading_i)])
     # Tolerance: times of up to 1e3 s are rounded by 1e-10 of a frame of 2.5 ms.
     assert found_hz == pytest.approx(rate, rel=1e-6)
-
-
-def test_frame_rate_cannot_be_measured_from_single_readings():
-    with pytest.raises(ParamsError, match="is computed from successive readings of the same indentation"):
-        rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
 
 def test_scores_equal_scikit_learn_and_loops():
@@ -122,14 +105,6 @@ def test_scores_equal_scikit_learn_and_loops():
     assert scored["p95_error_mm"] == pytest.approx(np.quantile(far_mm, 0.95))
     of_part_mm = [far for far, one in zip(far_mm, near, strict=True) if one]
     assert scored["median_error_near_seam_mm"] == pytest.approx(np.median(of_part_mm))
-
-
-@given(st.floats(0, 20), st.integers(0, 100))
-def test_all_place_errors_equal_the_offset_that_all_predictions_share(off_mm, seed):
-    true, _, _ = predictions(seed)
-    scored = score_places(true, true + (0.6 * off_mm, -0.8 * off_mm, 0.0), AREA.near_border(true[:, :2]))
-    for name in ("median_error_mm", "p95_error_mm", "median_error_near_seam_mm", "median_error_inside_mm"):
-        assert scored[name] == pytest.approx(off_mm, abs=1e-9)
 
 
 def scores_of(**networks: list[np.ndarray]) -> pd.DataFrame:
@@ -153,14 +128,3 @@ def test_numbers_of_each_method_are_means_over_its_networks():
     assert numbers["variants"]["knn"]["inside"]["median_error_mm"].mean == pytest.approx(one_mm)
     assert numbers["inside"]["pokes_n"] == 60
     assert "near_seam" not in numbers  # no press is near a border
-
-
-def test_each_tested_indentation_is_plotted_once():
-    true, predicted, indentation = predictions(n=20)
-    order = rng_for(0, "order").permutation(60)
-    plotted = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
-    np.testing.assert_allclose(plotted["x_mm"], true[::3, 0], atol=0.0051)  # Plotted places are rounded to 0.01 mm.
-    np.testing.assert_allclose(plotted["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
-    assert len(plotted["chips_x_mm"]) == len(CROSS_MM)
-    assert (plotted["borders_x_mm"], plotted["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
-    assert np.isfinite(plotted["error_mm"]).all()

@@ -1,6 +1,5 @@
 """Tests of experiment variation, which shows how readings at one place change over time and between skins."""
 
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.variation import (
-    LINES_MAX_N,
     Variation,
     Visits,
     figures,
     find_visits,
-    first_of_each_board,
     over_skins,
     over_time,
     variation,
@@ -86,12 +83,6 @@ def test_change_over_time_is_between_the_first_and_the_last_visit_within_the_lim
     assert plotted == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
 
 
-def test_plotted_visits_include_the_first_and_the_last():
-    _, plotted = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
-    assert len(plotted["contacts_n"]) == LINES_MAX_N
-    assert (plotted["contacts_n"][0], plotted["contacts_n"][-1]) == (0, 499)
-
-
 @given(st.floats(-500, 500), st.floats(0.5, 3))
 def test_drift_changes_raw_readings_but_not_field_changes(drift_uT, scale):
     db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
@@ -112,19 +103,6 @@ def test_spread_between_skins_is_the_rms_difference_over_all_pairs_of_skins():
     assert plotted == lines
 
 
-def test_plotted_line_of_a_skin_is_the_mean_over_visits():
-    numbers, plotted = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
-    assert plotted == {"s0": [2, 4]}
-    assert "spread_uT" not in numbers
-
-
-def test_skins_are_chosen_from_different_boards_in_turn():
-    boards = {"b0_s0": "b0", "b0_s1": "b0", "b1_s0": "b1", "b2_s0": "b2", "b2_s1": "b2"}
-    assert first_of_each_board(boards, 4) == ["b0_s0", "b1_s0", "b2_s0", "b0_s1"]
-    with pytest.raises(ParamsError, match="at most the 5 skins of the main captures; got 6"):
-        first_of_each_board(boards, 6)
-
-
 def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
     time = {
         "visits_n": 26, "contacts_n": 9750, "first_db_uT": 264.0, "raw_change_uT": 23.7, "raw_change_pct": 8.98,
@@ -137,36 +115,6 @@ def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
     ]
     when = {"contact_every_s": 0.0575, "lasts_s": 1166.2, "shown_s": 575.0, "warmer_K": 1.85}
     return {"depth_mm": 1.2, "worn_skin": "s0", "places": places} | when
-
-
-def figure_data(last_uT: float = 40.0) -> dict:
-    time = {"contacts_n": [0, 9750], "b_uT": [[0.0] * 15, [last_uT] * 15]}
-    place = {"time": time, "skins": {"s0": [1.0] * 15, "s1": [-300.0] * 15}}
-    return {"places": [place | {"x_mm": x_mm, "y_mm": 8.0} for x_mm in (8.0, 4.0)]}
-
-
-def test_figures_name_their_channels_places_and_skins():
-    texts = figures(numbers(), figure_data(), "simulated")
-    assert sorted(texts) == ["variation_skins.svg", "variation_time.svg"]
-    for text in texts.values():
-        ET.fromstring(text)
-        for label in (
-            "(simulated)",
-            "µT",
-            "at x = 8 mm, y = 8 mm",
-            "at x = 4 mm",
-            *(f"B{a}{c}" for c in range(5) for a in "xyz"),
-        ):
-            assert label in text
-    assert "contacts before" in texts["variation_time.svg"]
-    assert ">s1<" in texts["variation_skins.svg"]
-
-
-def test_equal_numbers_give_equal_figures():
-    first, again, other = (
-        figures(numbers(), lines, "simulated") for lines in (figure_data(), figure_data(), figure_data(99.0))
-    )
-    assert first == again != other
 
 
 def test_stage_recovers_the_known_drift_and_gain_of_skins(tmp_path, monkeypatch):

@@ -4,7 +4,6 @@ The loss of a network can have several terms. Each term has a batch of its own i
 """
 
 import numpy as np
-import pytest
 import torch
 
 from reskin.models.batches import Batch, BatchSampler, PreparedJob
@@ -36,10 +35,6 @@ def test_every_step_has_a_batch_for_each_term():
             name: (3, BATCH_N, 3 if name.endswith("targets") else 15)
             for name in ("inputs", "targets", "positive", "negative", *UNLABELLED, "few_labels", "few_labels_targets")
         }
-
-
-def test_batches_have_no_arrays_for_loss_terms_without_data():
-    assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 
 def test_targets_in_a_batch_belong_to_the_inputs_of_the_same_row():
@@ -121,18 +116,3 @@ def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
         for block in blocks:
             for one, other in zip(less.sample(STEPS_N), block, strict=True):
                 assert all(torch.equal(one[name], other[name]) for name in one)
-
-
-def test_different_blocks_and_networks_draw_different_rows():
-    same_rows = some_job(0)
-    other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
-    feed = BatchSampler([same_rows, other], BATCH_N, "cpu")
-    (first,), (second,) = feed.sample(1), feed.sample(1)
-    assert not torch.equal(first["inputs"][0], first["inputs"][1])
-    assert not torch.equal(first["inputs"], second["inputs"])
-
-
-@pytest.mark.parametrize(("n", "batch_n"), [(1, 16), (1, 1), (32, 1), (3, 100)])
-def test_few_rows_are_repeated_to_fill_a_batch(n, batch_n):
-    (step,) = batches([some_job(n=n)], 1, batch_n)
-    assert step["inputs"].shape == (1, batch_n, 15)

@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import pytest
 import torch
 
@@ -30,20 +27,3 @@ def test_optimiser_steps_equal_those_of_pytorch_bit_for_bit(steps_n, weight_deca
         rate.step()
         for one, other in zip(ours, theirs, strict=True):
             assert torch.equal(one, other)
-
-
-NETWORK_OF_THE_PAPER = """
-from reskin.models.job import LossWeights
-from reskin.models.train import train
-from tests.models.example_jobs import recipe, some_job
-
-train([some_job(0)], "paper", recipe(steps_n=2), LossWeights(0.0), "cpu")
-"""
-
-
-def test_training_does_not_import_the_compiler_of_pytorch():
-    """This project compiles no network, and importing PyTorch's compiler would cost two seconds in each process."""
-    ask = "print('torch._dynamo' in sys.modules)"
-    code = "\n".join(["import sys", NETWORK_OF_THE_PAPER, ask])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False"]

@@ -5,7 +5,7 @@ few labels. A control is trained like an adapted network, but without the unlabe
 """
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import grimp
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 from reskin.data.lines import Lines
 from reskin.models import job as job_module
 from reskin.models.batches import BatchSampler, prepare
-from reskin.models.job import CODE_MODULES, JobKeys, LossWeights, TrainingData, TrainingJob, TrainingResult
+from reskin.models.job import CODE_MODULES, JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.models.recipe import AugmentedRecipe
 from reskin.models.train import train_stack
 from tests.models.example_jobs import (
@@ -78,10 +78,6 @@ def test_adaptation_depends_on_the_fields_and_the_order_of_the_unlabelled_pokes(
     assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
-def test_lines_of_unlabelled_pokes_contain_no_places_and_no_forces():
-    assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
-
-
 def test_unlabelled_pokes_are_scaled_as_for_the_pretrained_network():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
@@ -130,13 +126,6 @@ def test_trained_network_does_not_depend_on_test_rows(scaling, view):
     assert (once.predicted != again.predicted).any()
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
-def test_scaler_is_fitted_to_training_rows(kind):
-    _, scaler = prepare(KINDS[kind](), with_values(example_data(), "db_uT", NEW, 1e6))
-    np.testing.assert_allclose(scaler.input_shift, example_data().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
-    np.testing.assert_allclose(scaler.target_scale, example_data().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
-
-
 def test_labelled_triplets_compare_distances_in_mm_on_the_same_skin():
     rows = example_data()
     prepared, _ = prepare(pooled(), rows)
@@ -148,14 +137,6 @@ def test_labelled_triplets_compare_distances_in_mm_on_the_same_skin():
         ].labelled.points
         is None
     )
-
-
-def test_weights_of_the_loss_terms_are_those_of_the_recipe():
-    assert pooled().loss_weights == LossWeights(0.5)
-    assert adaptation(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
-    assert fine_tuning(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
-    assert adaptation().schedule == adaptation().tuning.settings
-    assert pooled().schedule == pooled().recipe
 
 
 # --- Methods are compared in pairs, so they must be trained on equal batches. ---
@@ -179,21 +160,6 @@ def test_jobs_with_other_recipes_have_equal_initial_weights_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
-
-
-def test_adaptation_and_control_have_equal_batches():
-    pairs = zip(first_batches(adaptation()), first_batches(adaptation(unlabelled_weight=0.0)), strict=True)
-    assert all((a == b).all() for a, b in pairs)
-
-
-@pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
-def test_jobs_of_other_folds_or_seeds_have_other_weights_and_batches(changes):
-    other = replace(pooled(), **changes)
-    assert (
-        prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
-        != prepare(other, example_data())[0].initial_weights["layer1.weight"]
-    ).any()
-    assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
 # --- Keys, under which training results are stored in the cache ---
@@ -314,33 +280,10 @@ def test_cache_key_ignores_the_names_of_experiment_and_recipe():
     assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
-def test_cache_key_is_unchanged_if_rows_that_the_job_does_not_use_are_removed():
-    rows = example_data()
-    fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
-    moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
-    assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
-
-
-def test_data_digest_changes_if_rows_belong_to_other_skins():
-    rows = example_data()
-    other = replace(rows, skin=np.roll(rows.skin, 1))
-    assert JobKeys(rows).data_digest() != JobKeys(other).data_digest()
-
-
-def test_cache_keys_do_not_depend_on_earlier_calls():
-    book, jobs = JobKeys(example_data()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adaptation()]
-    assert [book.key(job) for job in jobs] == [key(job) for job in jobs]
-
-
 def test_cache_key_changes_with_the_code_that_trains(monkeypatch):
     before = key(pooled())
     monkeypatch.setattr(job_module, "digest", lambda name: f"another {name}")
     assert key(pooled()) != before
-
-
-def test_name_of_a_job_contains_recipe_fold_and_seed():
-    assert pooled().name == "triplet.paper.b1.seed0"
-    assert replace(adaptation(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 
 
 def test_augmented_copies_have_the_same_targets_and_count_as_new_skins():
@@ -353,17 +296,3 @@ def test_augmented_copies_have_the_same_targets_and_count_as_new_skins():
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
-
-
-def test_augmented_rows_depend_on_fold_and_seed():
-    settings = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
-    recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings})
-    other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings | {"gain_sd": 0.2}})
-    job = replace(pooled(), recipe=recipe)
-    augmented = [
-        prepare(one, example_data())[0].labelled.inputs
-        for one in (job, job, replace(job, fold="b9"), replace(job, seed_i=5))
-    ]
-    assert (augmented[0] == augmented[1]).all()
-    assert not any((augmented[0] == one).all() for one in augmented[2:])
-    assert key(job) != key(replace(job, recipe=other)) != key(pooled())

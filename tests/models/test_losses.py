@@ -8,9 +8,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.stats import special_ortho_group
 
 from reskin.models.losses import squared_error, triplet_loss
 from reskin.seeds import rng_for
@@ -70,21 +67,6 @@ def test_unknown_targets_are_ignored():
     assert torch.isfinite(predicted.grad).all()
 
 
-def test_gradient_of_the_squared_error_points_away_from_the_target():
-    predicted, truth = predictions("answer").requires_grad_(), predictions("truth")
-    squared_error(predicted, truth).sum().backward()
-    torch.testing.assert_close(predicted.grad, 2 * (predicted.detach() - truth) / (3 * B), rtol=SUM_RTOL, atol=1e-7)
-
-
-@given(st.floats(-100, 100))
-def test_squared_error_does_not_change_if_predictions_and_targets_are_shifted(shift):
-    predicted, truth = predictions("answer"), predictions("truth")
-    # Tolerance: numbers of up to 100 have rounding errors of about 1e-5 in single precision.
-    torch.testing.assert_close(
-        squared_error(predicted + shift, truth + shift), squared_error(predicted, truth), rtol=1e-3, atol=0
-    )
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_triplet_loss_equals_nested_loops(seed):
     anchor, positive, negative = random_triplet(seed)
@@ -92,13 +74,6 @@ def test_triplet_loss_equals_nested_loops(seed):
     np.testing.assert_allclose(
         triplet_loss(anchor, positive, negative), looped_triplet(anchor, positive, negative), rtol=SUM_RTOL
     )
-
-
-def test_triplet_with_a_nearer_positive_has_no_loss():
-    anchor = torch.zeros(1, 1, 2)
-    positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
-    assert float(triplet_loss(anchor, positive, negative)) == 0  # The loss has no margin, so any difference is enough.
-    assert float(triplet_loss(anchor, negative, positive)) > 0
 
 
 def test_gradient_of_a_triplet_with_a_nearer_negative_equals_the_closed_form():
@@ -124,27 +99,3 @@ def test_networks_of_a_stack_have_separate_losses():
     positive[1] += 10
     after = triplet_loss(anchor, positive, negative)
     assert (after == before).tolist() == [True, False, True]
-
-
-@given(st.integers(0, 1000), st.floats(-5, 5))
-def test_triplet_loss_is_invariant_under_rotation_and_shift(seed, shift):
-    turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
-    moved = [one @ turn + shift for one in random_triplet()]
-    # The tolerance is the rounding of differences of sums of about 80, from single-precision numbers of up to 10.
-    torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*random_triplet()), rtol=1e-4, atol=1e-4)
-
-
-@given(st.floats(0.01, 100))
-def test_triplet_loss_scales_with_the_square_of_the_features(k):
-    stretched = [one * k for one in random_triplet()]
-    # The tolerance is that of single precision.
-    torch.testing.assert_close(triplet_loss(*stretched), triplet_loss(*random_triplet()) * k**2, rtol=1e-4, atol=0)
-
-
-@given(st.integers(0, 1000))
-def test_swapping_positive_and_negative_changes_the_loss_by_the_difference_of_distances(seed):
-    anchor, positive, negative = random_triplet(seed)
-    both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
-    mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
-    # The tolerance is the rounding of single-precision sums of about 80.
-    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)

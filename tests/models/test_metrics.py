@@ -62,14 +62,6 @@ def test_registration_removes_a_constant_offset_of_places(dx_mm, dy_mm):
     assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
 
 
-@given(st.floats(1e-6, 1e6))
-def test_squared_force_error_scales_with_the_square_of_the_unit(scale):
-    predicted = TRUE + 0.25
-    scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
-    # The tolerance allows for two rounding errors per row.
-    assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
-
-
 BOARD = np.repeat(["b0", "b1"], 2)
 SKIN = np.array(["s0", "s1", "s1", "s2"])
 

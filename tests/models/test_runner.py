@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pipeline.executors import make_executor
 from reskin import io
-from reskin.errors import ReskinError, TrainingError
+from reskin.errors import ReskinError
 from reskin.models import train
 from reskin.models.batches import prepare
 from reskin.models.job import TrainingJob, TrainingResult
@@ -80,15 +80,6 @@ def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
-def test_result_says_whether_it_was_read_from_the_cache(tmp_path):
-    first = run(jobs(2), tmp_path)
-    both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
-    assert [one.reused for one in first] == [False, False]
-    assert [one.reused for one in both] == [True, True, False, False]
-    # For a result from the cache, `seconds` is the time that its training took.
-    assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])
-
-
 def test_results_are_in_the_order_of_jobs(tmp_path):
     selected = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
     done = run(selected, tmp_path)
@@ -150,22 +141,6 @@ def test_damaged_result_in_the_cache_is_reported_and_trained_again(tmp_path, dam
     assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_worker_killed_for_memory_is_explained(tmp_path, monkeypatch):
-    def allocate(*_: object) -> None:
-        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes.")
-
-    monkeypatch.setattr(train, "train_stack", allocate)
-    with pytest.raises(MemoryError, match="8000000000 bytes"):
-        run(jobs(), tmp_path, make_executor(1, imports="reskin.models.train"))
-
-
-def test_error_message_names_its_job(tmp_path):
-    with pytest.raises(
-        TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: all \d+ points are at one place"
-    ):
-        run([replace(job, train=np.array([0, 0, 12])) for job in jobs(1)], tmp_path)
-
-
 def test_finished_jobs_are_read_from_the_cache(tmp_path):
     log: list[str] = []
     first = run(jobs(), tmp_path)
@@ -190,12 +165,6 @@ def test_adding_a_job_trains_only_the_stack_of_the_new_job(tmp_path, more, train
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
 
 
-def test_renamed_job_is_read_from_the_cache(tmp_path):
-    run(jobs(1), tmp_path)
-    renamed = replace(jobs(1)[0], experiment="sensors", recipe_name="twin", what="multi")
-    assert trainings_n([renamed], tmp_path) == 0
-
-
 def test_equal_jobs_are_trained_only_once(tmp_path):
     one = jobs(1)[0]
     selected = [one, replace(one, recipe_name="twin"), one]
@@ -204,42 +173,12 @@ def test_equal_jobs_are_trained_only_once(tmp_path):
     assert all(equal_results(done[0], other) for other in done[1:])
 
 
-def test_different_jobs_with_the_same_name_are_both_trained(tmp_path):
-    one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
-    assert one.name == other.name
-    done = run([one, other], tmp_path)
-    assert not equal_results(*done)
-    assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
-
-
-def test_results_are_written_directly_to_the_folder_of_the_cache(tmp_path):
-    run(jobs(), tmp_path)
-    assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
-
-
-def test_files_in_the_cache_can_be_read_without_pickle(tmp_path):
-    run(jobs(1), tmp_path)
-    (file,) = tmp_path.glob("*.safetensors")
-    tensors, metadata = io.read_tensors(file)
-    assert tensors["weights.layer1.weight"].shape == (200, 15)
-    assert metadata["job"] == "lobo.paper.b0.seed0"
-    assert float(metadata["seconds"]) > 0
-
-
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
 def test_result_written_to_the_cache_is_read_unchanged(tmp_path, job):
     (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
     assert equal_results(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
-
-
-def test_network_whose_training_diverges_keeps_its_last_finite_weights(tmp_path):
-    wild = jobs(2, rate_max=1e30, batch_n=4)
-    for done in (run(wild, tmp_path), run(wild, tmp_path)):
-        assert [one.stopped_step for one in done] == [4, 4]
-        assert [one.curve for one in done] == [[], []]
-        assert all(np.isfinite(one.predicted).all() for one in done)
 
 
 # With these weights, all ReLUs are 0, so the output is constant and there is no gradient.
@@ -277,12 +216,6 @@ def test_training_that_collapses_to_a_constant_output_is_repeated_at_most_twice(
     assert any("collapsed" in line for line in log) == bool(dead)
 
 
-def test_short_training_is_not_checked_for_collapse(tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "prepare", prepare_dead({0, 1, 2}))
-    first, _ = run(jobs(2, steps_n=CHECKED_STEPS_N - 1), tmp_path)
-    assert (first.explained_min, first.collapsed) == (None, False)
-
-
 def test_constant_or_unknown_target_does_not_count_as_a_collapse(tmp_path):
     rows = example_data()
     flat, unknown = rows.target.copy(), rows.target.copy()
@@ -305,15 +238,6 @@ def test_training_in_a_worker_process_gives_the_same_result(tmp_path, monkeypatc
 
 def by_key(selected: list[TrainingJob]) -> dict[str, TrainingJob]:
     return {f"key{i}": job for i, job in enumerate(selected)}
-
-
-def test_jobs_with_equal_recipes_share_a_stack():
-    twin = [replace(job, recipe_name="twin") for job in jobs(1)]
-    assert [len(stack) for stack in make_stacks(by_key([*jobs(2), *twin]), 3)] == [3]
-    released = replace(adaptation(), recipe=pooled(architecture="released").recipe)
-    tuned = [adaptation(), released, adaptation(unlabelled_weight=0.0), fine_tuning()]
-    others = [jobs(1, steps_n=5)[0], without_triplets(), replace(jobs(1)[0], seed_i=1), *tuned]
-    assert [len(stack) for stack in make_stacks(by_key([*jobs(1), *others]), 3)] == [1] * 8
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))

@@ -47,17 +47,6 @@ def test_force_of_a_held_poke_follows_the_relaxation_function():
     np.testing.assert_allclose(relax(time_s, np.full(200, 3.0), SKIN_RELAXATION), truth, atol=3e-13)
 
 
-def test_state_of_relaxation_is_kept_if_neither_time_nor_force_changes():
-    state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
-    assert advance(state, 0.0, 0.0, SKIN_RELAXATION).tobytes() == state.tobytes()
-
-
-@given(changes)
-def test_instantaneous_change_of_the_force_is_not_relaxed(change):
-    """No time passes during the change, so each relaxing part of the force changes by its whole share."""
-    np.testing.assert_array_equal(advance(np.zeros(5), change, 0.0, SKIN_RELAXATION), SKIN_RELAXATION.share * change)
-
-
 @given(times_s, times_s, changes)
 def test_force_after_a_ramp_is_the_same_if_the_ramp_is_computed_in_two_steps(first_s, second_s, rate):
     whole = advance(np.ones(5), rate * (first_s + second_s), first_s + second_s, SKIN_RELAXATION)
@@ -66,29 +55,6 @@ def test_force_after_a_ramp_is_the_same_if_the_ramp_is_computed_in_two_steps(fir
     np.testing.assert_allclose(
         advance(halfway, rate * second_s, second_s, SKIN_RELAXATION), whole, atol=ROUNDING * size
     )
-
-
-@given(times_s, changes, st.floats(-3, 3))
-def test_state_of_relaxation_is_proportional_to_the_change_of_the_elastic_force(dt_s, change, factor):
-    once = advance(np.zeros(5), change, dt_s, SKIN_RELAXATION)
-    np.testing.assert_allclose(
-        advance(np.zeros(5), factor * change, dt_s, SKIN_RELAXATION), factor * once, atol=ROUNDING * 30
-    )
-
-
-def test_force_of_a_tip_at_rest_decreases_to_its_permanent_part():
-    relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
-    assert (np.diff(relaxed) <= ROUNDING).all()
-    assert relaxed[0] == pytest.approx(1, abs=ROUNDING)
-    assert relaxed[-1] == pytest.approx(1 - SKIN_RELAXATION.share.sum(), abs=1e-12)
-
-
-@pytest.mark.parametrize("dt_s", [-1e-9, np.nan, np.inf])
-def test_invalid_time_step_is_refused(dt_s):
-    with pytest.raises(ParamsError, match="time step"):
-        advance(np.zeros(5), 1.0, dt_s, SKIN_RELAXATION)
-    with pytest.raises(ParamsError, match="time step"):
-        relax(np.array([0.0, dt_s]), np.zeros(2), SKIN_RELAXATION)
 
 
 @pytest.mark.parametrize(("tau_s", "share"), [(0.0, 0.1), (-1.0, 0.1), (np.nan, 0.1), (1.0, -0.1), (1.0, 1.1)])
@@ -150,46 +116,18 @@ def test_field_memory_is_unchanged_by_stops_of_the_tip_above_the_skin():
     np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, MEMORY)[1][0, 0])
 
 
-@given(st.floats(-3, 3))
-def test_field_memory_is_linear_in_field_changes_and_zero_for_instant_presses(factor):
-    change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
-    for once, times in zip(field_memory(change_T, MEMORY), field_memory(factor * change_T, MEMORY), strict=True):
-        np.testing.assert_allclose(times, factor * once, atol=1e-18)
-    at_once = MEMORY.model_copy(update={"contact_s": 0.0, "rest_s": 0.0})
-    assert not any(part.any() for part in field_memory(change_T, at_once))
-
-
 def test_memory_shares_without_time_constants_are_refused():
     with pytest.raises(ValueError, match="one time for each share"):
         Memory(share=(0.1,), tau_s=(1.0, 2.0), contact_s=1.0, rest_s=1.0)
 
 
 DESIGN = {"settling": 0.10, "ageing": 0.01}
-counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=50).map(lambda n: np.array(sorted(n)))
-
-
-def test_softening_and_fading_begin_with_the_first_contact():
-    assert softening(np.array([0]), **DESIGN) == 1
-    assert fading(np.array([0]), per_decade=0.005) == 0
 
 
 def test_softening_is_the_sum_of_settling_and_ageing():
     # Expected after 300 contacts: settling of 0.1 (1 - e^-1) = 0.0632121 and ageing of 0.01 log10(1.3) = 0.0011394.
     # After 999,000 contacts: 0.1 + 0.01 * 3.
     np.testing.assert_allclose(softening(np.array([300, 999_000]), **DESIGN), [0.9356485, 0.87], atol=1e-7)
-
-
-def test_softening_from_contact_1000_to_1030_is_below_1_percent():
-    # Therefore softening may be neglected in a scene with few contacts on a skin that has had 1000 contacts before.
-    cycled = softening(np.array([1000, 1030]), **DESIGN)
-    assert 0 < 1 - cycled[1] / cycled[0] < 0.01
-
-
-@given(counts)
-def test_stiffness_never_increases_with_contacts(contacts_n):
-    left = softening(contacts_n, **DESIGN)
-    assert (np.diff(left) <= 0).all()
-    assert ((left > 0) & (left <= 1)).all()
 
 
 def test_magnetisation_fades_by_half_a_percent_per_decade_of_contacts():
@@ -204,12 +142,6 @@ def test_baseline_drift_grows_with_the_square_root_of_contacts():
     # The drift up to contact 10,000 contains the drift up to contact 100, which is a tenth as large. Therefore the
     # correlation of the two is 0.1.
     np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)
-
-
-def test_equal_generators_give_equal_baseline_drift():
-    first, again = (baseline_walk(np.arange(50), 15, step_T=1e-7, rng=rng_for(0, "wear")) for _ in range(2))
-    assert first.tobytes() == again.tobytes()
-    assert not first[0].any()  # There is no drift before the first contact.
 
 
 @pytest.mark.parametrize(

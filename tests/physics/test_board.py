@@ -76,13 +76,6 @@ def test_axes_of_tilted_chips_are_orthonormal(seed):
     assert (np.linalg.det(turn) > 0).all()
 
 
-def test_equal_name_and_seed_give_equal_boards():
-    first, again = (draw_board(design(), spreads(), seed=1, name="b0") for _ in range(2))
-    assert same(first, again)
-    assert not same(first, draw_board(design(), spreads(), seed=1, name="b1"))
-    assert not same(first, draw_board(design(), spreads(), seed=2, name="b0"))
-
-
 def test_drawn_boards_have_the_given_spreads():
     boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
     gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
@@ -111,24 +104,6 @@ def test_array_of_eight_boards_has_forty_chips():
         chips_of_tile = slice(5 * board_i, 5 * board_i + 5)
         np.testing.assert_allclose(board.chips_m[chips_of_tile], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
         np.testing.assert_allclose(board.turn[chips_of_tile], one.turn)
-
-
-@given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))
-def test_boards_of_an_array_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
-    tiles = {"columns_n": columns_n, "rows_n": rows_n, "pitch_mm": pitch_mm}
-    centres_mm = np.array(design(tiles=tiles).tiles.centres_mm)
-    assert len(centres_mm) == columns_n * rows_n
-    np.testing.assert_allclose(centres_mm.mean(axis=0), 0, atol=1e-9)
-    apart_mm = np.linalg.norm(centres_mm[:, None] - centres_mm, axis=2)[~np.eye(len(centres_mm), dtype=bool)]
-    assert apart_mm.min(initial=pitch_mm) == pytest.approx(pitch_mm)
-
-
-def test_array_of_one_board_equals_the_board():
-    alone = {"columns_n": 1, "rows_n": 1, "pitch_mm": 25.4}
-    assert same(
-        draw_board(design(), spreads(), seed=1, name="b0"),
-        draw_board(design(tiles=alone), spreads(), seed=1, name="b0"),
-    )
 
 
 def test_array_with_more_than_64_chips_is_refused():

@@ -25,14 +25,6 @@ THICKNESS_M = 2e-3
 rules = st.builds(Quadrature, cell_m=st.floats(0.3e-3, 5e-3), layers_n=st.integers(1, 8))
 
 
-@given(st.floats(2e-4, 1e-2), rules)
-def test_weights_of_all_nodes_sum_to_the_volume_of_the_skin(thickness_m, rule):
-    rest = place_nodes(thickness_m, rule)
-    volume_m3 = SKIN_SIDE_M**2 * thickness_m
-    np.testing.assert_allclose(rest.volumes_m3.sum(), volume_m3, rtol=1e-12)
-    np.testing.assert_allclose(rest.volumes_m3 @ rest.nodes_m / volume_m3, (0, 0, thickness_m / 2), atol=1e-15)
-
-
 @given(rules)
 def test_cells_end_at_seams_and_are_not_wider_than_the_given_width(rule):
     x_m = np.unique(place_nodes(THICKNESS_M, rule).nodes_m[:, 0])
@@ -72,13 +64,6 @@ def test_nodes_of_the_papers_skin_equal_those_of_nested_loops():
     np.testing.assert_array_equal(rest.nodes_m, naive_m)
 
 
-def test_six_layers_of_nodes_integrate_polynomials_of_degree_eleven_exactly():
-    rest = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE)
-    for power in range(12):
-        mean = rest.volumes_m3 @ (rest.nodes_m[:, 2] / THICKNESS_M) ** power / rest.volumes_m3.sum()
-        np.testing.assert_allclose(mean, 1 / (power + 1), rtol=1e-12)
-
-
 def test_quadrature_error_falls_with_the_square_of_the_cell_size():
     def error(cell_m):
         rest = place_nodes(THICKNESS_M, Quadrature(cell_m, 1))
@@ -91,16 +76,6 @@ def test_quadrature_error_falls_with_the_square_of_the_cell_size():
     # allows for the error of next order.
     coarse, fine = error(6.35e-3 / 8), error(6.35e-3 / 16)
     assert coarse / fine == pytest.approx(4, rel=0.05)
-
-
-def test_nodes_are_symmetric_under_rotation_by_90_degrees():
-    nodes_m = place_nodes(THICKNESS_M).nodes_m
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-
-    def rows(array):
-        return sorted(map(tuple, np.round(array, 12) + 0.0))
-
-    assert rows(nodes_m @ turn.T) == rows(nodes_m)
 
 
 @pytest.mark.parametrize(

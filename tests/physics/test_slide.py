@@ -60,23 +60,6 @@ def test_motion_of_a_square_pulled_at_its_edge_equals_the_closed_form():
     assert spin_rad == pytest.approx(3 * 1e-4 / 2.5 / SIDE_M, rel=1e-12)
 
 
-@given(places_m, displacements_m)
-def test_rigid_motion_has_the_given_displacement_at_the_pressed_place(place_m, taken_m):
-    move_m, spin_rad = motion_of(place_m, taken_m)
-    x, y = place_m
-    np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
-
-
-@given(places_m, displacements_m)
-def test_rotating_pull_and_place_rotates_the_rigid_motion(place_m, taken_m):
-    """A pull along the line through the middle causes no rotation."""
-    (move_m, spin_rad), quarter = motion_of(place_m, taken_m), np.array([[0, -1], [1, 0]])
-    turned_m, turned_rad = motion_of(quarter @ place_m, quarter @ taken_m)
-    np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
-    assert turned_rad == pytest.approx(spin_rad, rel=1e-12, abs=1e-18)
-    assert motion_of(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
-
-
 def test_displacement_of_the_skin_follows_force_and_distance_from_the_middle():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
@@ -112,14 +95,6 @@ def test_friction_limits_the_slide(place_m, taken_m, force_N):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
         np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
-
-
-def test_friction_allows_no_slide_at_zero_force_and_the_full_slide_at_a_large_one():
-    whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
-    for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
-        found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)
-        np.testing.assert_array_equal(found.move_m, share * whole.move_m)
-        np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
 
 def test_press_without_slide_leaves_the_deformation_on_a_slipping_base_unchanged():
@@ -198,10 +173,3 @@ def test_force_without_stiffening_is_that_of_the_bonded_layer():
     chi = np.sqrt(3e-3 * at_m) / H_M
     series = 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
     np.testing.assert_allclose(bonded_N, 16 / 9 * 1.9e5 * np.sqrt(3e-3) * at_m**1.5 * series, rtol=0.1)
-
-
-def test_depth_of_a_sharp_tip_is_limited_by_its_radius():
-    layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5, "stiffening": 0.0}
-    assert slide.depth_at(np.array([0.1]), **layer_settings)[0] < 0.5e-3
-    assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(0.999 * 0.5e-3)
-    assert slide.count_clipped(np.array([1e-3, 1e6]), **layer_settings) == 1

@@ -9,7 +9,6 @@ from pipeline.paper import TABLE_2
 from pipeline.report.figures import (
     HEADLINE,
     IN_CONTEXT,
-    Outline,
     bar,
     error_grid,
     score_figures,
@@ -23,42 +22,10 @@ from tests.report.synthetic import all_experiments, new_board, texts_of
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)
 
 
-def draw_grid(error_mm: float = 0.5) -> str:
-    return error_grid(PLACES_MM, PLACES_MM + error_mm, title="lab (recorded), lobo")
-
-
-def test_figure_of_place_errors_has_units_and_source():
-    text = draw_grid()
-    ET.fromstring(text)
-    for label in ("x / mm", "y / mm", "mean error at this place / mm", "recorded"):
-        assert label in text
-
-
-def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
-    elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # The figure on the paper's grid has more elements: five chips, the skin and two entries of the legend. Its axes
-    # have two spines fewer.
-    assert draw_grid().count("-patch_") - elsewhere.count("-patch_") == 5 + 1 + 2 - 2
-    assert "chip" in draw_grid()
-    assert "chip" not in elsewhere
-
-
-def test_outline_of_another_board_replaces_that_of_the_papers_board():
-    outline = Outline((10.0, 4.0), (30.0, 20.0), ((20.0, 10.0), (25.0, 15.0)))
-    text = error_grid(PLACES_MM + 12, PLACES_MM + 12, title="mine", outline=outline)
-    # The paper's board has five chips, the other board two.
-    assert draw_grid().count("-patch_") - text.count("-patch_") == 5 - 2
-
-
 def test_title_of_the_figure_states_the_place_with_the_largest_error():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
     assert "worst 3.00 mm at (2, 2) mm" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
-
-
-def test_equal_errors_give_an_equal_figure():
-    assert draw_grid() == draw_grid()
-    assert draw_grid() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
 
 
 def row(accuracy_pct: float, mse_xy_mm2: float = 0.5, **spread) -> dict:
@@ -75,19 +42,6 @@ SENSORS = [
     for i, method in enumerate(("multi", "triplet", "adapted"))
     for n in (1, 3, 6, 9, 12, 15)
 ]
-
-
-def test_figure_of_the_number_of_pokes_has_labels():
-    labels = texts_of(sweep_pokes(POKES, "simulated"))
-    for label in ("0", "65", "3900", "simulated", "%", "mm²", "paper's table 2", "pokes"):
-        assert label in labels
-
-
-def test_figure_of_the_number_of_sensors_has_a_line_for_each_method():
-    labels = texts_of(sweep_sensors(SENSORS, "recorded"))
-    for label in ("multi-sensor + triplet", "adapted", "training skins", "recorded"):
-        assert label in labels
-    assert "adapted" not in texts_of(sweep_sensors([one for one in SENSORS if one["method"] == "multi"], "recorded"))
 
 
 def test_error_bars_do_not_exceed_the_range_of_the_metric():
@@ -142,17 +96,6 @@ def test_headline_of_recorded_boards_has_the_mean_of_each_method_and_number_of_l
     rms_N = TABLE_2["adapted"]["mse_f_N2"][0] ** 0.5
     for label in ("recorded", "rms error / N", "constant force", "paper, adapted", f"{rms_N:.2f}"):
         assert label in labels
-
-
-def test_headline_has_no_panel_of_forces_if_the_recordings_have_none():
-    without_forces = [{name: row[name] for name in row if name != "rms_f_N"} for row in LAB["new_board"]]
-    labels = texts_of(score_figures(LAB | {"new_board": without_forces}, "recorded")[HEADLINE])
-    assert "within 1 mm" in labels
-    assert "force" not in labels.replace("(other skins and forces)", "")
-
-
-def test_scenes_without_held_out_boards_have_no_headline():
-    assert score_figures({"provenance": {}}, "recorded") == {}
 
 
 def test_bars_of_few_boards_reach_from_lowest_to_highest():

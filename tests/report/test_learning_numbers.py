@@ -4,8 +4,6 @@ They are compared with values calculated by hand. Some of the numbers are contra
 points of a sweep.
 """
 
-import json
-
 import pandas as pd
 import pytest
 
@@ -89,11 +87,6 @@ def test_scores_of_table_2_are_averaged_over_skins_and_then_over_boards():
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 
-def test_numbers_of_the_control_include_its_number_of_pokes():
-    assert numbers()["adapt"]["pokes_n"] == 390
-    assert numbers()["adapt"]["control"]["accuracy_pct"] == over(79.5, 81.5)
-
-
 def over(*boards: float) -> dict:
     sd = (boards[1] - boards[0]) / 2**0.5
     return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "values": pytest.approx(list(boards))}
@@ -127,25 +120,6 @@ def test_protocol_counts_the_data_for_training_and_for_tests():
     assert counts["lobo"]["skins_n"] == len({skin for one in cards for skin in one["scores"]["by_skin"]})
     assert counts["lobo"]["trained_on_skins_n"] == len(cards[0]["train_skins"])
     assert counts["lobo"]["trained_on_rows_n"] == cards[0]["train_rows_n"]
-
-
-def test_numbers_contain_only_the_experiments_that_were_run():
-    assert numbers([]) == {"variants": {}}
-    assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "protocol", "variants"}
-    without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
-    assert without.keys() == {"table2", "lobo", "paired", "protocol", "variants"}
-    assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
-    alone = numbers(adapted_cards("paper", 78.0, 1.0))
-    assert alone.keys() == {"table2", "adapt", "protocol", "variants"}
-    assert alone["adapt"] == {"pokes_n": 390}  # There is no control, so its numbers are missing.
-    assert "null" not in json.dumps(numbers())
-
-
-def test_scores_of_networks_with_other_recipes_are_only_in_the_variants():
-    alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
-    assert numbers() == alone | {"variants": numbers()["variants"]}
-    assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
-    assert numbers()["variants"]["adapt"]["other"]["accuracy_pct"] == over(6.0, 10.0)
 
 
 def test_sweep_over_the_number_of_pokes_is_sorted():
@@ -204,18 +178,6 @@ def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
     assert gains(found["pokes_gain"]) == {"b0": 10.0, "b1": 4.0}
     assert gains(found["pokes_plateau"]) == {"b0": 1.0, "b1": -1.0}
     assert found["pokes_gain"]["accuracy_pct"].values == pytest.approx([10.0, 4.0])
-
-
-def test_contrasts_at_counts_that_the_sweep_does_not_contain_are_missing():
-    found = contrasts_of_pokes(rows("pokes", points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})))
-    assert found.keys() == {"pokes_first", "pokes_gain"}
-    assert found["pokes_gain"]["to_pokes_n"] == 390
-    assert contrasts_of_pokes(rows("pokes", points("pokes_n", {0: (70, 80)}))) == {}
-    only = points("trained_on_skins_n", {1: (50, 60)}, method="multi")
-    others = [point | {"method": method} for method in ("triplet", "adapted") for point in only]
-    assert contrasts_of_sensors(rows("sensors", [*only, *others])).keys() == {
-        "sensors_adapted_over_multi", "sensors_adapted_over_triplet",
-    }  # fmt: skip
 
 
 def test_contrasts_of_sensors_are_differences_between_methods_and_numbers_of_skins():

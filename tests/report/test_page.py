@@ -8,12 +8,11 @@ import pandas as pd
 import pytest
 
 from pipeline.report import page
-from pipeline.report.page import Page, index_page, run_page, scene_page
-from pipeline.report.tables import make_tables, run_tables
+from pipeline.report.page import Page, index_page, scene_page
+from pipeline.report.tables import make_tables
 from reskin import io
 from reskin.code import ROOT
 from reskin.errors import SchemaError
-from tests.report.synthetic import all_experiments
 
 SVG = """<?xml version="1.0"?>
 <svg viewBox="0 0 1 1"><defs><path id="p"/></defs><use href="#p" clip-path="url(#p)"/></svg>"""
@@ -70,30 +69,12 @@ def test_page_shows_the_numbers_of_the_scene():
     assert "72 [61, 79] %" in html
 
 
-def test_page_of_boards_with_few_labels_and_without_forces_is_whole():
-    numbers = io.read_json(ROOT / "reports/lab/numbers.json")
-    of_forces = {"rms_f_N", "mse_f_N2", "r2_f", "coverage_f_pct"}
-    numbers["new_board"] = [
-        {name: value for name, value in row.items() if name not in of_forces}
-        for row in numbers["new_board"]
-        if row.get("labels_n", 0) < 20
-    ]
-    html = scene_page(numbers, {}, figures_of("*.md"))
-    assert "with 10 labels" in html
-    assert "40 labels" not in html
-
-
 def test_tables_and_figures_that_no_section_names_are_shown_at_the_end():
     numbers = io.read_json(ROOT / "reports/quick/numbers.json")
     html = scene_page(numbers, {"mine": pd.DataFrame({"<a>": ["<b>"]})}, figures_of("*.md") | {"own.svg": SVG})
     assert 'id="own"' in html
     assert "&lt;b&gt;" in html
     assert "<b>" not in html
-
-
-def test_table_without_rows_is_not_shown():
-    numbers = io.read_json(ROOT / "reports/quick/numbers.json")
-    assert "surprise" not in scene_page(numbers, {"surprise": pd.DataFrame({"a": []})}, figures_of("*.md"))
 
 
 def test_ids_of_figures_stay_unique():
@@ -110,13 +91,6 @@ def test_name_that_does_not_exist_is_an_error_that_names_the_file(tmp_path, monk
     monkeypatch.setattr(page, "FOLDER", tmp_path)
     with pytest.raises(SchemaError, match=r"broken\.md, line 3: .*table3"):
         Page({"table2": 1}).fill("broken.md")
-
-
-def test_page_of_a_run_has_commit_and_times():
-    numbers = all_experiments()
-    html = run_page(numbers, run_tables(numbers), {"time.svg": SVG})
-    assert numbers["provenance"]["device"] in html
-    assert 'id="time"' in html
 
 
 def test_index_lists_every_scene_once_for_each_result():

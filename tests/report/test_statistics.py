@@ -25,7 +25,6 @@ from pipeline.scores import (
 from pipeline.statistics import (
     Stat,
     add_seed_sd,
-    board_means,
     holm,
     interval,
     over_boards,
@@ -33,9 +32,7 @@ from pipeline.statistics import (
     over_pairs,
     paired,
     paired_with_single,
-    statistic,
     t_interval,
-    tally,
     two_way_error,
 )
 from reskin.data.splits import Split, draw_folds
@@ -150,11 +147,6 @@ def test_interval_equals_students_interval_of_scipy(values):
     assert interval(values) == pytest.approx([low, high], abs=DOUBLE)
 
 
-def test_single_value_has_no_standard_deviation():
-    assert statistic([5.0]) == statistic([5.0], boards=True) == Stat(5.0, 1)
-    assert statistic([80.0, 90.0]).to_json() == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
-
-
 @FEW
 @given(PAIRS)
 def test_paired_difference_equals_scipys_paired_t_test(pairs):
@@ -198,35 +190,6 @@ def test_paired_difference_equals_loops_over_skins_and_seeds():
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
     assert found["mse_xy_mm2"].mean < 0  # The first method has the smaller error.
-
-
-def test_difference_of_a_method_from_itself_is_zero():
-    assert paired(skin_scores(), skin_scores())["accuracy_pct"] == Stat(0.0, 2, 0.0, values=(0.0, 0.0))
-    assert paired(skin_scores(), by_skin(rows_of_cards(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"].n == 2
-
-
-def test_more_skins_with_equal_scores_do_not_change_the_difference():
-    once, thrice = ({f"b{i}": [[float(i)]] * n for i in range(3)} for n in (1, 3))
-    nothing = {board: [[0.0]] * 3 for board in thrice}
-    assert paired(score_table(thrice), score_table(nothing)) == paired(score_table(once), board_scores([0.0] * 3))
-
-
-@FEW
-@given(VALUES, st.integers(0, 99))
-def test_order_of_rows_does_not_change_the_difference(values, seed):
-    first = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
-    over = score_table({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
-    assert paired(first.sample(frac=1, random_state=seed), over[::-1]) == paired(first, over)
-
-
-@FEW
-@given(VALUES)
-def test_swapping_the_methods_negates_the_difference(values):
-    first, second = board_scores(values), board_scores([1.0] * len(values))
-    forward, backward = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
-    low, high = forward.ci95
-    assert backward.ci95 == pytest.approx((-high, -low), abs=DOUBLE)
-    assert backward.mean == pytest.approx(-forward.mean, abs=DOUBLE)
 
 
 def test_methods_tested_on_different_skins_cannot_be_compared():
@@ -297,28 +260,12 @@ def test_intervals_stay_in_the_range_of_the_metric(values):
 
 
 @FEW
-@given(st.lists(st.floats(49.9, 50.1), min_size=4, max_size=9))
-def test_bounded_interval_equals_students_interval_far_from_the_bounds(values):
-    plain, bounded = np.array(interval(values)), np.array(interval(values, "accuracy_pct"))
-    np.testing.assert_allclose(bounded, plain, atol=0.02 * np.ptp(plain) + 1e-9)
-
-
-@FEW
 @given(st.dictionaries(st.text(min_size=1, max_size=3), st.floats(0, 1), min_size=1, max_size=8))
 def test_corrected_p_values_equal_the_definition_of_holm(p_values):
     adjusted, names = holm(p_values), sorted(p_values, key=lambda name: p_values[name])
     for rank, name in enumerate(names):
         worst = max((len(names) - i) * p_values[names[i]] for i in range(rank + 1))
         assert adjusted[name] == min(1.0, worst)
-
-
-def test_scores_that_are_missing_are_ignored():
-    known = pd.DataFrame([
-        {"board": "b0", "skin": "s0", "mse_f_N2": 1.0, "mse_xy_mm2": 2.0},
-        {"board": "b0", "skin": "s1", "mse_xy_mm2": 4.0},
-    ])  # fmt: skip
-    assert board_means(known).to_dict("index") == {"b0": {"mse_f_N2": 1.0, "mse_xy_mm2": 3.0}}
-    assert set(paired(skin_scores(force=False), skin_scores(force=False))) == {"accuracy_pct", "mse_xy_mm2", "by_board"}
 
 
 def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
@@ -375,16 +322,3 @@ def test_experiment_transfer_tests_each_skin_on_the_same_rows_as_experiment_lobo
         for skin in skins:
             pooled = many[skin].test
             assert fold.test[table.skin[fold.test] == skin].tolist() == pooled[table.skin[pooled] == skin].tolist()
-
-
-TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collapsed_before_n": st.integers(0, 2)}))
-
-
-@given(TRAININGS)
-def test_trainings_that_were_repeated_are_counted_with_all_their_attempts(done):
-    attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
-    assert tally(done) == {
-        "trainings_n": sum(map(len, attempts)),
-        "collapsed_n": sum(map(sum, attempts)),
-        "kept_collapsed_n": sum(collapses[-1] for collapses in attempts),
-    }

@@ -6,13 +6,11 @@ Other tests check the names of captures, random seeds, and optional terms of the
 import numpy as np
 import pytest
 
-from reskin.board.stream import FrameStream
-from reskin.board.wire import concatenate
 from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
 from reskin.physics.board import draw_board
 from reskin.physics.skin import changes_of_field, draw_skin, forces
-from reskin.simulation.capture import list_captures, simulate_capture, to_files
+from reskin.simulation.capture import list_captures, simulate_capture
 from tests.simulation.scene import (
     AGEING,
     DRAG,
@@ -157,16 +155,6 @@ def test_fields_of_scattered_pokes_are_those_at_the_labelled_places():
     assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
 
 
-def test_frames_of_forty_chips_are_encoded_and_decoded_unchanged():
-    one = capture_of(sleeve(), "sleeve", board="v0", skin="v0_s0")
-    header, files = to_files(one, sleeve())
-    assert (header.chips_n, len(files["stream.bin"])) == (40, 6 * FRAMES_N * (16 * 40 + 2))
-    stream = FrameStream("binary", 40)
-    frames = concatenate([stream.feed(files["stream.bin"]), stream.close()], 40)
-    np.testing.assert_array_equal(frames.b_uT, one.b_uT)
-    np.testing.assert_array_equal(frames.temperature_degC, one.temperature_degC)
-
-
 def test_hand_pokes_have_fields_but_no_labels():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
@@ -222,41 +210,11 @@ def test_warming_raises_chip_temperatures_and_weakens_the_field(capture):
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 
 
-def test_equal_settings_give_equal_captures(capture):
-    assert same(capture, capture_of())
-    assert not same(capture, capture_of(seed=2))
-
-
 def test_adding_boards_skins_or_protocols_does_not_change_other_captures(capture):
     boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
     more = with_protocol("hand", HAND, boards=boards)
     assert set(list_captures(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
     assert same(capture, capture_of(more))
-
-
-def test_captures_do_not_depend_on_the_order_in_which_they_are_simulated():
-    assert list_captures(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
-        ("b0", "b0_s0"),
-        ("b0", "b0_s1"),
-        ("b1", "b1_s0"),
-    ]
-
-
-def test_skins_of_one_board_have_different_fields(capture):
-    other = capture_of(skin="b0_s1")
-    # The limit is six standard deviations of the noise.
-    assert not np.allclose(frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20)
-
-
-def test_skin_without_magnetisation_has_no_signal():
-    b_uT = frames_by_indentation(capture_of(synthesis("skin", saturation_T=0.0)))
-    np.testing.assert_allclose(b_uT.std(axis=(0, 1)), np.tile([3.3, 3.3, 5.0], (5, 1)), rtol=0.1)
-
-
-@pytest.mark.parametrize(("section", "name"), [("rig", "rate"), ("skin", "stickiness"), ("spreads", "chip_gian")])
-def test_error_names_an_unknown_parameter(section, name):
-    with pytest.raises(ParamsError, match=name):
-        synthesis(section, **{name: 1.0})
 
 
 @pytest.mark.parametrize(

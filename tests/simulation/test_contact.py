@@ -57,12 +57,6 @@ def test_softening_and_relaxation_reduce_all_components_of_the_force():
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 
 
-def test_tilted_tip_causes_a_sideways_force(first):
-    one = response(tilt=0.1, friction=Friction(coefficient=0.8))
-    np.testing.assert_allclose(one.force_N[:, 0, 0], 0.1 * one.force_N[:, 0, 2])
-    assert np.linalg.norm(one.change_T[0, 0] - first[1]) > 0.01 * np.linalg.norm(first[1])
-
-
 @pytest.mark.parametrize(("depth_mm", "deep"), [(0.5, False), (1.4, True)])
 def test_presses_deeper_than_the_verified_depth_are_counted(depth_mm, deep):
     tip_m = np.array([[[0.0, 0.0, depth_mm * 1e-3]]])

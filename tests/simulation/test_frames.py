@@ -43,13 +43,6 @@ def test_frames_do_not_depend_on_the_size_of_blocks(rate_hz, monkeypatch):
     np.testing.assert_array_equal(whole.temperature_degC, parts.temperature_degC)
 
 
-def test_repeated_conversions_repeat_their_noise():
-    slow, fast = (read(rate_hz=rate_hz).b_uT.reshape(-1, CHIPS_N, 3) for rate_hz in (400.0, 1000.0))
-    repeats = [(one[1:] == one[:-1]).all(axis=2).mean() for one in (slow, fast)]
-    assert repeats[0] == 0
-    assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # A conversion takes 1.84 ms, and a frame 1 ms.
-
-
 def test_chip_reads_the_field_of_an_earlier_time_because_conversion_takes_time():
     one = response()
     ramp = one.change_T[:, 0].copy()

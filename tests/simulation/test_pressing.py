@@ -14,12 +14,10 @@ from reskin.recordings.readers.sd_card import read_log
 from reskin.seeds import rng_for
 from reskin.simulation.capture import simulate_capture, to_files
 from reskin.simulation.protocols import (
-    LIFTED_MM,
     Press,
     Walk,
     depths_under_load,
     half_sine,
-    load_steps_N,
 )
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.simulation.scene import synthesis, with_protocol
@@ -38,11 +36,6 @@ def capture_of(name, protocol, **changes):
     return simulate_capture(with_protocol(name, protocol, **changes), name, board="b0", skin="b0_s0", seed=1)
 
 
-def draw_presses(presses_n, name="presses"):
-    section = PRESS | {"presses_n": presses_n, "duration_s": (0.05, 1.0), "terms": ()}
-    return Press(**section).plan(rng_for(0, name), SKIN_MM)
-
-
 @given(st.floats(1e-3, 2.0))
 def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
@@ -50,19 +43,9 @@ def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
-def test_depth_increases_with_the_weight():
-    depth_m = depths_under_load(SKIN, load_steps_N(1.0, 0.02)[None])[0]
-    assert depth_m[0] == -SKIN.depth_zero_m
-    assert (np.diff(depth_m) > 0).all()
-
-
 def test_weight_that_is_too_heavy_for_the_skin_is_refused():
     with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, the force at the greatest depth"):
         depths_under_load(SKIN, np.array([[1e4]]))
-
-
-def test_weight_of_the_glass_increases_in_equal_steps():
-    np.testing.assert_allclose(load_steps_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
 
 
 def test_labels_of_a_filling_are_weights_and_no_depths():
@@ -75,16 +58,6 @@ def test_labels_of_a_filling_are_weights_and_no_depths():
     assert set(log.x_mm[log.contact]) == {8.0}
 
 
-def test_field_change_grows_with_the_weight():
-    quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
-    b_uT = capture_of("glass", GLASS, chip=quiet).b_uT.reshape(3, -1, 15)
-    lifted_n, dwell_n = 1 + 4 + 2, 1 + 3
-    stops_uT = b_uT[:, lifted_n : lifted_n + 5 * dwell_n].reshape(3, 5, dwell_n, 15)[:, :, -1]
-    change_uT = np.linalg.norm(stops_uT - b_uT[:, 1:2], axis=2)
-    assert (change_uT[:, 0] <= 0.7 * 4).all()  # Tolerance: each of 15 channels is rounded by half a step.
-    assert (np.diff(change_uT, axis=1) > 10).all()
-
-
 def test_half_sine_press_is_symmetric_in_time():
     depth_mm = half_sine(101, 0.8)
     assert depth_mm.argmax() == 50
@@ -92,17 +65,6 @@ def test_half_sine_press_is_symmetric_in_time():
     np.testing.assert_allclose(depth_mm, depth_mm[::-1], atol=1e-12)
     # The tolerance is the error of the midpoint rule, (pi / 2 n)^2 / 6.
     assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)
-
-
-def test_logarithms_of_durations_are_uniform():
-    stops = draw_presses(2000)
-    frames_n = (stops.depth_mm > 0).sum(axis=1)
-    position = np.log(frames_n / 20) / np.log(20)
-    # The tolerance is four standard errors of a median, 0.5 / sqrt(n) each.
-    np.testing.assert_allclose(np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05)
-    after = np.arange(stops.depth_mm.shape[1]) >= frames_n[:, None]
-    assert (stops.depth_mm[after] == LIFTED_MM).all()
-    assert stops.depth_mm.max() <= 1.2
 
 
 def test_walk_has_the_given_number_of_footfalls_of_limited_duration():
@@ -184,16 +146,3 @@ def test_walk_is_written_as_the_log_of_an_sd_card(tmp_path):
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
         open_capture(tmp_path / capture.name, DEFAULT_POLICY)
-
-
-def test_presses_and_fillings_are_valid_captures(tmp_path):
-    for name, protocol in (("press", PRESS), ("glass", GLASS)):
-        capture = capture_of(name, protocol)
-        write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))
-        opened = open_capture(tmp_path / capture.name, DEFAULT_POLICY)
-        blocks = list(opened.blocks)
-        logged_N = capture.probe.Fz_N[capture.probe.contact]
-        readings_n = 1 if name == "press" else 3
-        np.testing.assert_array_equal(np.concatenate([one.Fz_N for one in blocks]), np.repeat(logged_N, readings_n))
-        assert not [key for key in opened.account if key.startswith("fault_")]  # A healthy board raises no alarm.
-        assert opened.account["indentations_n"] == protocol.get("presses_n", protocol.get("passes_n"))

@@ -31,21 +31,6 @@ def test_grid_pass_has_390_indentations():
     np.testing.assert_array_equal(plan.pass_i, np.repeat([0, 1], 390))
 
 
-def test_lines_of_a_drag_are_2_mm_apart():
-    plan = plan_of(DRAG)
-    assert plan.x_mm.shape == (2 * 18, 17)  # There are lines along 9 rows and 9 columns, at two depths.
-    rows, columns = slice(0, 9), slice(9, 18)
-    np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
-    np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])
-    np.testing.assert_allclose(np.abs(np.diff(plan.x_mm[rows], axis=1)), 1.0)
-    np.testing.assert_allclose(np.abs(np.diff(plan.y_mm[columns], axis=1)), 1.0)
-
-
-def test_neighbouring_drag_lines_have_opposite_directions():
-    steps_mm = np.diff(plan_of(DRAG).x_mm, axis=1)[:9, 0]
-    np.testing.assert_array_equal(np.sign(steps_mm), np.where(np.arange(9) % 2 == 0, 1, -1))
-
-
 def test_every_second_pass_drags_backwards():
     one, two = plan_of(DRAG), plan_of(DRAG.model_copy(update={"passes_n": 3}))
     n = len(one)
@@ -73,13 +58,6 @@ def test_hand_protocol_has_325_pokes_without_labels():
     assert plan.tilt.std() == pytest.approx(np.tan(np.radians(5.0)), rel=0.15)
     # The tolerance is four standard errors, 0.23 / sqrt(325) each.
     assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)
-
-
-def test_places_depend_on_the_random_generator_only_for_hand_pokes():
-    for protocol, alike in ((GRID, True), (DRAG, True), (HAND, False)):
-        one, other = plan_of(protocol, "one"), plan_of(protocol, "other")
-        assert np.array_equal(one.x_mm, other.x_mm) == alike
-        assert np.array_equal(plan_of(protocol, "one").depth_mm, one.depth_mm)
 
 
 SCATTER = {
@@ -110,11 +88,6 @@ def test_scattered_places_keep_a_margin_to_the_edges(skin_mm, margin_mm):
     assert plan.centre_mm == (skin_mm[0] / 2, skin_mm[1] / 2)
     assert plan.labelled
     assert not plan.tilt.any()
-
-
-def test_scattered_places_depend_on_the_name_of_the_protocol():
-    assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
-    assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
 
 
 def test_margin_of_half_the_skin_or_more_is_refused():

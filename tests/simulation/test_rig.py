@@ -45,12 +45,6 @@ def test_timeline_of_an_indentation_is_rest_approach_contact_and_retraction():
     assert not frames.stop_i.any()
 
 
-def test_timeline_of_a_dragged_line_has_a_dwell_at_each_stop():
-    frames = timeline(rig(), 3)
-    assert frames.stop_i.tolist() == [0] * 7 + [0] * 4 + [1] * 4 + [2] * 4 + [2] * 2
-    assert frames.contact_i.tolist() == [8, 12, 16]
-
-
 @given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
 def test_chunks_contain_every_frame_once_and_never_arrive_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
@@ -132,7 +126,3 @@ def test_noise_of_the_force_sensor_has_the_given_standard_deviation():
     read_N, clipped_n = read_clipped(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
     assert (read_N <= np.float32(FORCE_RANGE_N)).all()
     assert 1400 < clipped_n < 1600  # The expected number is half of 3000. The limits are 3.7 standard deviations.
-
-
-def test_equal_generators_give_equal_forces():
-    assert read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes() == read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes()

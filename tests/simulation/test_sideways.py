@@ -56,16 +56,6 @@ def test_drag_without_friction_equals_a_press():
     np.testing.assert_array_equal(found.change_T, press_T(tip_m))
 
 
-def test_direction_of_the_drag_changes_the_field():
-    forward, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
-    np.testing.assert_allclose(forward.force_N[0, 1], -back.force_N[0, 1])
-    alone_T = press_T(line(1.0))[0, 0]
-    size_T = np.linalg.norm(alone_T)
-    for one, other in ((forward, alone_T), (back, alone_T)):
-        assert np.linalg.norm(one.change_T[0, 1] - other) > 0.1 * size_T
-    assert np.linalg.norm(forward.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
-
-
 def test_mirrored_drag_has_the_mirrored_field():
     # The reflection x -> -x swaps chips 1 and 3, and leaves the checkerboard unchanged as a field of axial vectors. By
     # and Bz therefore change sign.
@@ -79,19 +69,6 @@ def test_force_of_a_leaning_tip_is_limited_by_friction():
     for lean, share in ((0.1, 0.1), (2.0, 0.8)):
         found = drag(line(1.0), tilt=np.array([[0.0, lean]])).force_N[0, 0]
         np.testing.assert_allclose(found, [0.0, share * normal_N], rtol=1e-12)
-
-
-def test_tip_above_the_skin_causes_no_force_and_no_field_change():
-    tip_m = line(0.0, 2.0) * (1, 1, -1)
-    found = drag(tip_m)
-    assert not found.force_N.any()
-    assert not found.change_T.any()
-
-
-def test_force_of_a_dragged_line_does_not_depend_on_earlier_lines():
-    lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
-    both, second = drag(lines_m, tilt=np.zeros((2, 2))), drag(lines_m[1:])
-    np.testing.assert_allclose(both.force_N[1], second.force_N[0])
 
 
 @pytest.mark.parametrize("coefficient", [0.3, 0.8])
@@ -119,14 +96,6 @@ def test_drag_equals_a_press_followed_by_many_small_shears():
     # The tolerance is 20 %, because the code takes one or two midpoint steps and moves the traction. A wrong sign would
     # give 50 % or more.
     assert np.linalg.norm(found.change_T[0, 1] - truth_T) < 0.2 * np.linalg.norm(truth_T)
-
-
-def test_raising_the_skin_equals_dragging_deeper():
-    high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
-    on_higher_skin = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
-    deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
-    np.testing.assert_allclose(on_higher_skin.force_N, deeper.force_N, rtol=1e-9)
-    np.testing.assert_allclose(on_higher_skin.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
 
 
 HOLD = HoldDesign(give_um=(0.0, 0.0), away_um_mm=0.0, lets_go_N=8.0, springs_N_mm=7.0, friction=0.8)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from reskin.config import parse, read_yaml
+from reskin.config import parse
 from reskin.layouts import PAPER, geometry
 from reskin.physics import slide
 from reskin.physics.board import Board, BoardDesign, Spreads, draw_board
@@ -20,7 +20,6 @@ from reskin.simulation.defaults import SHARED, nominal
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = {name: nominal(name) for name in SHARED}
-QUICK = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
 DESIGN = parse(SkinDesign, PARAMS["skin"], "skin")
 SPREADS = parse(Spreads, PARAMS["spreads"], "spreads")
 RIGID = parse(BoardDesign, geometry(PAPER)["design"], "layout")
@@ -28,12 +27,7 @@ TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
 STOPS_N = 48  # A path has this number of stops. The finer path has twice as many.
-# Limit on a ratio: the largest change of dB between two stops on the finer path, divided by the largest change on the
-# coarse path. The ratio is 0.5 if dB is smooth, and 1 if dB jumps.
-HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-# These drags are so short that the tip does not begin to slide.
-short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))
 FEW = settings(max_examples=8, deadline=None)
 
 
@@ -76,12 +70,6 @@ def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
     return np.column_stack([place_m, depths_of_forces_m(skin, force_N)])[None]
 
 
-def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> float:
-    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=coefficient))
-    assert not found.change_T[0, [0, -1]].any()
-    return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
-
-
 @FEW
 @example((0.0, 0.0), 0.0, 1.0, 2.2e-311, 0.0, 0)  # Here, the coefficient of friction is a subnormal number.
 @given(
@@ -104,15 +92,6 @@ def test_sum_of_sideways_forces_of_press_and_drag_is_limited_by_friction(
         assert not found.slide_m.any()
 
 
-def test_tip_without_friction_does_not_move_the_skin():
-    board, skin = draw_board_and_skin("b0")
-    tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
-    slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.0))
-    assert not slippery.force_N.any()
-    assert not slippery.slide_m.any()
-    assert slippery.change_T.any()
-
-
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
 def test_field_changes_smoothly_while_a_sticking_tip_is_pressed_deeper(depth_m):
     board, skin = draw_board_and_skin("b0")
@@ -123,27 +102,6 @@ def test_field_changes_smoothly_while_a_sticking_tip_is_pressed_deeper(depth_m):
     found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.8))
     steps_uT = sizes_uT(np.diff(found.change_T[0, 1:], axis=0))
     assert steps_uT.max() < 1.5 * np.median(steps_uT)
-
-
-@settings(max_examples=2, deadline=None)
-@given(places, short_drags_m, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
-def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forces_N, name_i):
-    board, skin = draw_board_and_skin(f"b{name_i}")
-    end_m = tuple(np.add(start_m, drag_m))
-    coarse, fine = (
-        largest_step_uT(board, skin, path(skin, (start_m, end_m), forces_N, n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
-    )
-    assert fine <= HALVED * coarse
-
-
-def test_smoothness_check_detects_a_slide_that_friction_does_not_limit(monkeypatch):
-    board, skin = draw_board_and_skin("b0")
-    monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
-    place_m = (6e-3, 2e-3)
-    coarse, fine = (
-        largest_step_uT(board, skin, path(skin, (place_m, place_m), (0.5, 0.6), n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
-    )
-    assert fine > HALVED * coarse
 
 
 @pytest.mark.parametrize("terms", [(), ("memory",)])

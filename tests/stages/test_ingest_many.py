@@ -72,12 +72,3 @@ def test_capture_is_read_again_if_its_cached_file_is_damaged(run, capsys):
     assert run() == ["c1"]
     assert f"{cached.name} are damaged, because the file has changed since it was written" in capsys.readouterr().err
     assert run() == []
-
-
-def test_capture_is_read_again_if_a_killed_stage_left_a_partial_file(run):
-    run()
-    cached = run.folder / stage.CACHE / "lab"
-    (file,) = [file for file in cached.iterdir() if file.read_text() == "c2"]
-    file.rename(cached / f"{file.stem.partition('-')[0]}.parquet").write_text("half")
-    assert run() == ["c2"]
-    assert len(list(cached.iterdir())) == 3

@@ -25,16 +25,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline.catalogue import ANALYSES
-from pipeline.report.claims import read_claims, resolve
-from pipeline.report.numbers import join, timed_rows
 from reskin import io
 from reskin.models.inputs import Scaler
 from tests.compiled import compile_kernels
 from tests.sizes import FULL
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
-LEARNING = ("train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "audit")
-RANDOM = ("new_board", "drift", "manual", "interference")  # experiments with random draws
 EXPERIMENTS_OF_CI = set(ANALYSES) - {"compare"}  # scene ci runs all experiments except this, which needs recordings
 OUTPUT = "output.txt"  # file with the output of the first run
 # The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
@@ -89,16 +85,6 @@ def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
     assert set(scores) == {"table2", "single_sensor", "shear", "new_board"}
     assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted"}
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
-
-
-def test_stage_costs_count_training_runs(story):
-    stages = json.loads((story / "reports/ci/provenance.json").read_text())["runtime"]["stages"]
-    for stage_name in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift"):
-        assert stages[stage_name]["trainings_n"] > 0
-        assert stages[stage_name]["computed_s"] > 0
-    assert stages["train_multi"]["reused_n"] == 0
-    assert stages["split"]["trainings_n"] == 0
-    assert stages["split"]["computed_s"] == stages["split"]["seconds"]
 
 
 def test_protocols_are_simulated_into_separate_folders(story):
@@ -207,19 +193,6 @@ def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(s
         assert all("mse_f_N2" in row["spread"] for row in numbers["drift"][policy])
 
 
-def test_claims_are_about_existing_numbers(numbers):
-    missing = [claim.id for claim in read_claims() if claim.ours and resolve(numbers, claim.ours) is None]
-    assert missing == ["plateau-accuracy_pct"]  # the sweep of scene ci is too short to reach a plateau
-
-
-def test_captures_and_frames_of_each_protocol_are_counted(story, numbers):
-    for protocol in ("wear", "drag", "hand", "flexible", "sleeve"):
-        account = numbers["capture_by_protocol"][protocol]
-        files = list((story / f"data/indentations/ci-{protocol}").glob("*.parquet"))
-        assert account["captures_n"] == len(files)
-        assert account["frames_n"] == sum(io.read_ingest_counts(file)["frames_n"] for file in files)
-
-
 def test_reskin_predict_estimates_contacts_from_a_log_of_an_sd_card(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
@@ -229,16 +202,6 @@ def test_reskin_predict_estimates_contacts_from_a_log_of_an_sd_card(story):
     contact = estimates["contact"].astype(bool)
     assert 0.1 < contact.mean() < 0.9  # the log of a walk has rest, steps and swings
     assert np.isfinite(estimates.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
-
-
-def test_methods_have_errors_in_the_numbers_and_times_in_the_provenance(story, numbers):
-    rows = timed_rows(join(numbers, json.loads((story / "reports/ci/provenance.json").read_text())))
-    methods = [row for row in rows if row["method"] != "reference" and row["study"] != "neglected term"]
-    assert all(("seconds" in row) == (row["error"] is not None) for row in methods)
-    assert {"training", "adaptation", "neglected term"} <= {row["study"] for row in rows}
-    assert all(case["holds"] for case in numbers["extremes"]["cases"])
-    assert set(numbers["described"]) == {"grid"}
-    assert "<svg" in (story / "reports/ci/run.html").read_text()
 
 
 def test_each_capture_has_a_parquet_file_with_units(story):
@@ -298,16 +261,6 @@ def test_mlflow_runs_have_the_duration_and_the_loss_curve_of_their_training(stor
     assert client.get_model_version_by_alias("reskin-ci", "champion")
 
 
-@slow
-def test_repeated_training_gives_the_same_lock_file(story, run_stages):
-    before = (story / "dvc.lock").read_text()
-    for file in (story / ".reskin/cells").glob("*.safetensors"):
-        file.unlink()  # otherwise, the cached training runs would be reused
-    stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *RANDOM, "report")]
-    run_stages(*stages)
-    assert (story / "dvc.lock").read_text() == before
-
-
 def test_dvc_repro_restores_deleted_models_without_running_stages(story):
     models = sorted((story / "data/models/ci/train_multi").iterdir())
     content = models[0].read_bytes()
@@ -320,15 +273,6 @@ def test_dvc_repro_restores_deleted_models_without_running_stages(story):
     assert "Running stage" not in output
     assert models[0].read_bytes() == content
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
-
-
-def test_dvc_status_lists_an_edited_report(story):
-    file = story / "reports/ci/numbers.json"
-    content = file.read_text()
-    file.write_text(content.replace("simulated", "recorded", 1))
-    output = run(story, "dvc", "status", "report@ci").stdout
-    file.write_text(content)
-    assert re.search(r"modified:\s+reports/ci/numbers.json", output)
 
 
 def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):

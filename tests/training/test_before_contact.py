@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.settings import Settings
-from pipeline.training.before_contact import gather_hover, gather_scan, number_in_pass, score_before_contact
+from pipeline.training.before_contact import gather_hover, gather_scan, score_before_contact
 from pipeline.training.jobs import SceneData
 from reskin import io
 from reskin.data.rows import Selection, gather
@@ -102,16 +102,6 @@ def test_hovering_tip_is_located_only_if_it_is_magnetic(tmp_path):
     found = score_hovering(tmp_path, magnetic=False)
     assert found["hover"]["accuracy_pct"] < CHANCE_MAX_PCT
     assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
-
-
-def test_scan_in_random_order_reveals_no_place(tmp_path):
-    assert max(score_scan(tmp_path, snake=False, memory=0.1).values()) < CHANCE_MAX_PCT
-
-
-def test_indentations_are_numbered_from_0_in_each_pass():
-    press = np.array([7, 7, 8, 20, 21, 21], np.int32)
-    one = readings(indentation=press, pass_i=np.array([0, 0, 0, 1, 1, 1], np.int32))
-    assert number_in_pass(one).tolist() == [0, 0, 1, 0, 1, 1]
 
 
 def test_indentations_keep_their_numbers_if_rows_without_a_place_are_excluded():

@@ -3,10 +3,8 @@
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from pipeline.training.choice import choose, to_record
+from pipeline.training.choice import choose
 from reskin.errors import ParamsError
 from tests.report import synthetic
 from tests.scenes import RECIPE
@@ -65,24 +63,6 @@ def test_settings_with_the_smallest_place_error_are_chosen():
     # Recipe `light` is better without adaptation, and recipe `heavy` is better after adaptation.
     assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0
     assert chosen["adapt"]["settings"]["unlabelled_weight"] == 0.1
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.permutations(CARDS))
-def test_choice_does_not_depend_on_the_order_of_model_cards(cards):
-    assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
-
-
-def test_all_candidates_are_listed_with_scores():
-    scores = {
-        stage: {one["recipe_name"]: one["mse_xy_mm2"].mean for one in chosen["candidates"]}
-        for stage, chosen in choose(CARDS).items()
-    }
-    assert scores == {
-        "train_multi": {"slow": 0.5, "fast": 0.3, "fastest": 0.4},
-        "train_triplet": {"light": 0.35, "heavy": 0.6},
-        "adapt": {"from-light": 0.34, "from-heavy": 0.25},
-    }
 
 
 def test_settings_are_compared_by_the_mean_over_boards():
@@ -155,15 +135,6 @@ def test_choice_without_candidates_is_refused(cards, stage):
         choose(cards)
 
 
-def test_record_of_the_choice_lists_boards_skins_and_settings():
-    cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
-    record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
-    assert record["physics"] == "abc"
-    assert (record["scene"], record["source"], record["seed"]) == ("tuning", "simulated", 777)
-    assert (record["boards"], record["skins"]) == (["b0", "b1", "b2"], ["b0_s0", "b1_s0", "b2_s0"])
-    assert record["chosen"] == {stage: one["settings"] for stage, one in choose(CARDS).items()}
-
-
 def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
     """Return a copy of a model card with another number of steps and another error."""
     return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
@@ -182,15 +153,6 @@ def test_choice_raises_if_candidates_differ_in_the_number_of_steps():
     assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3
 
 
-def test_control_is_listed_but_not_chosen():
-    control = adapted_card("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
-    chosen = choose([*CARDS, control])["adapt"]
-    assert chosen["recipe_name"] == "from-heavy"
-    assert (chosen["error"], chosen["control"]) == (pytest.approx(0.25), pytest.approx(0.2))
-    assert "from-heavy-control" in {one["recipe_name"] for one in chosen["candidates"]}
-    assert "control" not in choose(CARDS)["adapt"]
-
-
 @pytest.mark.parametrize("failure", [{"collapsed": True}, {"collapsed_before_n": 1}])
 def test_settings_with_which_a_training_collapsed_are_not_chosen(failure):
     # With the same settings, the training on the other board did not collapse.
@@ -199,8 +161,3 @@ def test_settings_with_which_a_training_collapsed_are_not_chosen(failure):
     collapsed_cards = [one | failure if one["question"] == "lobo" else one for one in CARDS]
     with pytest.raises(ParamsError, match="all candidates of train_multi have a collapsed"):
         choose(collapsed_cards)
-
-
-def test_collapsed_network_is_not_a_base_for_adaptation():
-    cards = [one | {"collapsed_before_n": 1} if one["recipe_name"] == "heavy" else one for one in CARDS]
-    assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-light", "train_triplet": "light"}

@@ -15,12 +15,6 @@ PARAMS = {name: nominal(name) for name in SHARED}
 CURRENT = fingerprint(PARAMS)
 
 
-def test_order_of_settings_does_not_change_the_fingerprint():
-    reordered = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
-    assert fingerprint(reordered) == CURRENT
-    assert len(CURRENT) == 16
-
-
 @pytest.mark.parametrize(
     ("section", "name", "value"),
     [

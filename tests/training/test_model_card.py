@@ -1,7 +1,5 @@
 """Tests of model cards, which describe trained networks and their scores."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -58,21 +56,10 @@ def test_model_card_describes_the_network():
         assert (np.array(result["scaler"][name], np.float32) == values).all()
 
 
-@pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_model_card_can_be_written_as_json(job):
-    written = card(job)
-    assert json.loads(json.dumps(written, allow_nan=False)) == written
-
-
 @pytest.mark.parametrize(("explained", "collapsed"), [(None, False), (0.9, False), (0.049, True), (-3.0, True)])
 def test_model_card_states_whether_and_how_often_the_training_collapsed(explained, collapsed):
     result = card(pooled(), explained_min=explained, collapsed_before_n=1)
     assert (result["explained_min"], result["collapsed"], result["collapsed_before_n"]) == (explained, collapsed, 1)
-
-
-def test_model_card_states_that_the_training_was_stopped_early():
-    assert card(pooled())["stopped_step"] is None
-    assert card(pooled(), stopped_step=150)["stopped_step"] == 150
 
 
 @pytest.mark.parametrize(
