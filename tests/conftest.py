@@ -28,7 +28,8 @@ settings.load_profile("same")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 LONG = (  # The slowest test files, which run stages and commands.
-    "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
+    "stages/test_story", "test_lab_story",
+    "manage/test_fetch", "manage/test_add", "stages/test_reruns", "test_numerics",
 )  # fmt: skip
 CHECKED_N = 5  # The number of calls of a function whose arrays are checked in each test.
 calls_n: Counter[Any] = Counter()

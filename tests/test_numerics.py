@@ -29,13 +29,13 @@ needs_avx2 = pytest.mark.skipif(
 
 @cache
 def digests_under(*settings: str) -> str:
-    """Return the digests of tests.arithmetic, run in a new process with these environment variables."""
+    """Return the digests of tools.arithmetic, run in a new process with these environment variables."""
     inherited = {
         name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")
     }
     # Waiting threads sleep, because otherwise they would use most of the processor time. This changes no sums.
     environment = inherited | {"OMP_WAIT_POLICY": "PASSIVE"} | dict(setting.split("=") for setting in settings)
-    command = [sys.executable, "-m", "tests.arithmetic"]
+    command = [sys.executable, "-m", "tools.arithmetic"]
     return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 

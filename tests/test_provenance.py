@@ -1,4 +1,5 @@
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -6,6 +7,8 @@ from pipeline import provenance
 from pipeline.provenance import (
     clear_cost,
     code_version_of,
+    home,
+    is_experiment,
     processor_name,
     read_costs,
     record_cost,
@@ -99,3 +102,12 @@ def test_costs_of_a_killed_run_are_dropped(tmp_path):
     clear_cost(tmp_path, "train")  # The stage was killed, and starts again.
     record_cost(tmp_path, "train", 2.0)
     assert read_costs(tmp_path)["train"]["trainings_s"] == {}
+
+
+def test_dvc_experiments_use_the_caches_of_the_checkout(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (home(), is_experiment()) == (Path(), False)
+    copy = tmp_path / ".dvc/tmp/exps/standard/tmpx1"
+    copy.mkdir(parents=True)
+    monkeypatch.chdir(copy)
+    assert (home(), is_experiment()) == (tmp_path, True)

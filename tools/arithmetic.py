@@ -1,8 +1,8 @@
 """Print a digest of the weights after a tiny training run, on this processor or on emulated processors.
 
 The run trains the paper's networks (several at once, as a stack, with all terms of the loss). The training of the
-universal model is not exact to the bit: its file is an input. `python -m tests.arithmetic` prints the digest;
-test_numerics.py calls this command with several environment variables. `python -m tests.arithmetic Haswell-v2 EPYC-v1`
+universal model is not exact to the bit: its file is an input. `python -m tools.arithmetic` prints the digest;
+test_numerics.py calls this command with several environment variables. `python -m tools.arithmetic Haswell-v2 EPYC-v1`
 also runs on these two processors, emulated by QEMU (package qemu-user; about two minutes per processor; `qemu-x86_64
 -cpu help` lists the processors), and fails if the digests differ. MKL and PyTorch select code by the maker and the
 instruction sets of the processor, so emulation finds differences that environment variables alone cannot cause.
@@ -42,7 +42,7 @@ def paper_networks() -> str:
 
 def digests_on(name: str) -> str:
     """Return the digests computed on the emulated processor with this QEMU name."""
-    command = ["qemu-x86_64", "-cpu", name, sys.executable, "-m", "tests.arithmetic"]
+    command = ["qemu-x86_64", "-cpu", name, sys.executable, "-m", "tools.arithmetic"]
     # Under QEMU, NumPy reads the real /proc/cpuinfo and warns about instruction sets that the emulated processor lacks.
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": ""}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from tests.sizes import FULL
-from tests.tutorial import PAGE, checkout_copy, differences, read_steps, run
+from tools.tutorial import PAGE, checkout_copy, differences, read_steps, run
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),

@@ -1,7 +1,7 @@
 """Run docs/tutorial.md: its commands in a copy of the checkout, in order, with their outputs.
 
-`python -m tests.tutorial --write` runs all steps (about ten minutes) and replaces the outputs on the page.
-tests/test_tutorial.py runs the quick steps, or all of them with RESKIN_SLOW_TESTS=1, and compares the outputs.
+`python -m tools.tutorial --write` runs all steps (about ten minutes) and replaces the outputs on the page.
+tests.docs.test_tutorial.py runs the quick steps, or all of them with RESKIN_SLOW_TESTS=1, and compares the outputs.
 
 A step is a block of code (sh or python). The block of text that follows is the output of the step. An HTML comment
 before a step has options, separated by semicolons:
@@ -226,7 +226,7 @@ def checkout_copy() -> Iterator[Path]:
 
 def main() -> None:
     if sys.argv[1:] != ["--write"]:
-        sys.exit("usage: python -m tests.tutorial --write")
+        sys.exit("usage: python -m tools.tutorial --write")
     text = PAGE.read_text(encoding="utf-8")
     with checkout_copy() as folder:
         done = list(run(read_steps(text), folder, say=print))

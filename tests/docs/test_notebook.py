@@ -10,7 +10,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-FILE = Path(__file__).resolve().parents[1] / "docs/notebook.ipynb"
+FILE = Path(__file__).resolve().parents[2] / "docs/notebook.ipynb"
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def root(tmp_path) -> Path:
 
 
 def start(root: Path, *command: str) -> subprocess.Popen[str]:
-    environment = variables(Path(__file__).resolve().parents[1])
+    environment = variables(Path(__file__).resolve().parents[2])
     return subprocess.Popen(
         [sys.executable, *command], cwd=root, env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

@@ -13,7 +13,7 @@ from pipeline.stages.code import all_stages, digests_of
 from reskin import code
 from reskin.code import file_of, files_of
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
 STAGES = {name: stage.get("do", stage) for name, stage in FLOW.items()}
 OTHERS = sorted(STAGES.keys() - {"code"})

@@ -1,9 +1,7 @@
-"""Tests that the docs name all parameters, columns and numbers, and only files that exist."""
+"""Tests of the docs: settings in examples are valid, links and named files exist."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
@@ -11,18 +9,7 @@ from ruamel.yaml import YAML
 from pipeline.scenes import check_scene
 from pipeline.settings import Settings, read_shared_files
 
-ROOT = Path(__file__).resolve().parents[1]
-# Sections whose keys are names of entries (such as recipes or boards), not parameters.
-NAMED = {"situations", "recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
-
-
-def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
-    """Yield the keys of nested settings. Keys of the first `names_depth` levels are names and are omitted."""
-    for key, value in settings.items() if isinstance(settings, dict) else ():
-        if not names_depth:
-            yield key
-        levels_n = 1 if key in NAMED else 0
-        yield from keys(value, max(levels_n, names_depth - 1))
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_scene_and_recipe_of_the_docs_are_valid():
@@ -38,6 +25,15 @@ def test_scene_and_recipe_of_the_docs_are_valid():
     "page", [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md"], ids=lambda page: page.name
 )
 def test_files_named_in_docs_exist(page):
-    files = re.findall(r"`((?:reskin|pipeline|tests)/[\w./-]+)`", page.read_text(encoding="utf-8"))
+    files = re.findall(r"`((?:reskin|pipeline)/[\w./-]+)`", page.read_text(encoding="utf-8"))
     examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # Files of examples, which users create.
     assert sorted({name for name in files if not (ROOT / name).exists() and not examples.match(name)}) == []
+
+
+def test_links_in_the_docs_are_valid():
+    broken = []
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "data/README.md"]:
+        for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+            if "://" not in link and not (page.parent / link).exists():
+                broken.append(f"{page.name}: {link}")
+    assert broken == []

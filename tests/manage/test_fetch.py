@@ -20,14 +20,14 @@ from reskin.errors import ReskinError
 from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
 from reskin.recordings.readers import READERS, lab
+from tests.manage.test_add import contents
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout, copy_without_code
-from tests.test_adding import contents
 from tests.test_pickled import archive_of_csv
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SOURCES = fetching.read_sources(ROOT)
 
 

@@ -1,7 +1,6 @@
 """Tests of the generated blocks of README.md and docs, and of the links of all pages."""
 
 import copy
-import re
 import subprocess
 
 import pytest
@@ -42,12 +41,3 @@ def test_changed_result_changes_its_cell(scenes):
 def test_page_without_markers_is_refused(scenes):
     with pytest.raises(SchemaError, match="README.md"):
         fill_blocks("README.md", "no markers", scenes, {})
-
-
-def test_links_in_the_docs_are_valid():
-    broken = []
-    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "data/README.md"]:
-        for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
-            if "://" not in link and not (page.parent / link).exists():
-                broken.append(f"{page.name}: {link}")
-    assert broken == []
