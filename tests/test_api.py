@@ -146,6 +146,13 @@ def test_loaded_model_returns_the_predictions_of_its_network(model):  # noqa: F8
         loaded.predict([1.0, 2.0])
 
 
+def test_shipped_model_called_with_field_changes_equals_its_predictions_of_readings():
+    noload_uT, b_uT, _ = reskin.simulate_pokes(reskin.draw_skin(), [[6.0, 9.0, 1.0], [10.0, 5.0, 0.6]])
+    universal = reskin.load_universal().zero(noload_uT)
+    called = universal(b_uT - noload_uT.mean(axis=0, dtype=np.float64))
+    np.testing.assert_allclose(called, universal.predict(b_uT), atol=1e-3)
+
+
 def test_simulated_recording_is_loaded_in_the_same_way_as_a_recorded_one(tmp_path):
     folder = reskin.simulate_recording(tmp_path / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
     frame = reskin.load_recording(folder)

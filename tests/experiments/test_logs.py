@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from pipeline.experiments.logs import (
     PITCHES_DEG,
@@ -15,7 +16,19 @@ from pipeline.experiments.logs import (
     score_pitches,
 )
 from reskin.errors import CaptureError
-from reskin.logs import contacts_n, describe, estimate, quiet_start, score_contacts, truth_at
+from reskin.logs import (
+    FALSE_SHARE,
+    QUIET_MIN_S,
+    START_WINDOWS_N,
+    WINDOW_S,
+    contacts_n,
+    describe,
+    estimate,
+    quiet_start,
+    score_contacts,
+    thin,
+    truth_at,
+)
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, Instrument
 from reskin.physics.board import Board
 from reskin.seeds import rng_for
@@ -97,6 +110,28 @@ def test_score_is_the_mean_score_of_networks_and_not_that_of_their_mean_predicti
     # The largest force is the mean of the largest forces of the three networks, which are 3, 5 and 6 N.
     assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)
     assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.75, False), (1.25, True)])
+def test_quiet_start_ends_at_a_pulse_that_noise_does_not_explain(share, is_found):
+    """The limit is that of normal noise whose standard deviation is known, for all means compared in half a second."""
+    window_n, channels_n, draws_n = round(WINDOW_S * RATE_HZ), 15, 20
+    error_uT = NOISE_uT * np.sqrt(1 / window_n + 1 / (START_WINDOWS_N * window_n))
+    limit_uT = norm.isf(FALSE_SHARE / (channels_n * QUIET_MIN_S / WINDOW_S) / 2) * error_uT
+    found = []
+    for i in range(draws_n):
+        t_s, b_uT, _ = make_log(steps_n=0, quiet_s=8.0, name=f"pulse {i}")
+        b_uT[40 * window_n : 41 * window_n, 3] += share * limit_uT
+        found.append(quiet_start(t_s, b_uT, where="log") == 40 * window_n)
+    # A pulse of 0.75 or 1.25 times the limit is found with a probability of 13 or 87 %.
+    assert np.mean(found) == pytest.approx(0.87 if is_found else 0.13, abs=0.25)
+
+
+def test_plotted_range_contains_the_estimates_of_all_networks():
+    t_s, b_uT, force_N = make_log()
+    networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
+    plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
+    assert [np.nanmax(np.array(plotted[which]["x_mm"], float)) for which in ("low", "estimated", "high")] == [6, 8, 9]
 
 
 def test_true_values_of_a_reading_are_those_of_the_step_at_its_time():
