@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -151,8 +152,8 @@ def tests_of(path: Path) -> list[str]:
     return [str(file.relative_to(ROOT)) for file in dict.fromkeys(importing[:IMPORTING_N] + others)]
 
 
-def is_caught(mutant: Mutant, checkout: Path, limit_s: float) -> str:
-    """Plant the mutant in the copy and run its tests; return the first test that fails, or an empty text."""
+def outcome(mutant: Mutant, checkout: Path, limit_s: float) -> str:
+    """Plant the mutant in the copy and run its tests; return `killed by TEST`, `SURVIVED` or `out of time`."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "RESKIN_EXECUTOR": "here"}
     command = [sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no"]
     source = (checkout / mutant.path).read_text(encoding="utf-8")
@@ -166,11 +167,11 @@ def is_caught(mutant: Mutant, checkout: Path, limit_s: float) -> str:
             timeout=limit_s, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return ""
+        return "out of time"
     finally:
         (checkout / mutant.path).write_text(source, encoding="utf-8")
     failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", tests.stdout, re.M)
-    return "" if tests.returncode == 0 else (failed or ["all"])[0]
+    return "SURVIVED" if tests.returncode == 0 else f"killed by {(failed or ['all'])[0]}"
 
 
 def main() -> None:
@@ -183,20 +184,20 @@ def main() -> None:
     given = parser.parse_args()
     modules = [file for path in given.paths for file in ([path] if path.suffix else sorted(path.rglob("*.py")))]
     mutants = draw([file for file in modules if not re.search(given.without, str(file))], given.n, given.seed)
-    caught_n = 0
+    found: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         checkout = Path(folder) / "checkout"
         shutil.copytree(ROOT, checkout, ignore=shutil.ignore_patterns(*NOT_COPIED))
         for mutant in mutants:
             start_s = time.monotonic()
-            caught_by = is_caught(mutant, checkout, given.limit_s)
-            caught_n += bool(caught_by)
-            said = f"killed by {caught_by}" if caught_by else "SURVIVED"
+            said = outcome(mutant, checkout, given.limit_s)
+            found[said.partition(" by ")[0]] += 1
             print(f"{mutant.path}:{mutant.line} {mutant.function}: {said} ({time.monotonic() - start_s:.0f} s)")
             before = (ROOT / mutant.path).read_text(encoding="utf-8").splitlines()
             diff = list(difflib.unified_diff(before, mutant.source.splitlines(), n=0, lineterm=""))
             print("\n".join(f"    {line}" for line in diff[3:]), flush=True)
-    print(f"{caught_n} of {len(mutants)} mutants killed ({caught_n / max(1, len(mutants)):.0%})")
+    ended_n = found["killed"] + found["SURVIVED"]
+    print(f"{found['killed']} of {ended_n} mutants killed ({found['killed'] / max(1, ended_n):.0%}); {dict(found)}")
 
 
 if __name__ == "__main__":
