@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.servers import ServerError, running
+from deploy.servers import running
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -31,10 +31,3 @@ def test_program_and_its_child_processes_end_at_the_end_of_the_with_block(tmp_pa
         for _ in range(100):  # waits until init has removed the ended processes
             os.killpg(group, 0)
             time.sleep(0.05)
-
-
-def test_error_for_a_stopped_server_contains_its_last_output(tmp_path):
-    with running("it", ["sh", "-c", "echo no such folder; exit 3"], tmp_path / "log") as alive:
-        with pytest.raises(ServerError, match="it has stopped \\(exit status 3\\).*no such folder"):
-            while True:
-                alive()

@@ -77,18 +77,6 @@ def test_field_is_described_without_forces():
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_contacts_of_unknown_place_and_force_are_described_by_their_fields():
-    found = describe(example_readings(places=False, known_force=False))
-    assert found["field_at_rest_channel_max_uT"] == 2500
-    assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
-
-
-def test_rows_without_contact_are_described_only_by_their_fields_at_rest():
-    found = describe(example_readings(places=False))
-    assert found["field_at_rest_channel_max_uT"] == 2500
-    assert {"force_max_N", "noise_z_uT", "weakest_over_strongest_chip"}.isdisjoint(found)
-
-
 def test_values_of_the_captures_of_one_skin_are_averaged_first():
     summary = over_skins([("s0", {"a": 1.0}), ("s0", {"a": 3.0}), ("s1", {"a": 4.0, "b": 7.0})])
     assert summary["a"] == {"mean": 3.0, "least": 2.0, "most": 4.0, "sd": pytest.approx(np.sqrt(2)), "n": 2}

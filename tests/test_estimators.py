@@ -5,14 +5,13 @@ import warnings
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupKFold, cross_validate
 from sklearn.utils.estimator_checks import check_estimator
 
 import reskin
 from reskin import metrics
 from reskin.config import parse
-from reskin.errors import ParamsError, SchemaError, TrainingError
+from reskin.errors import ParamsError, SchemaError
 from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import Recipe
 from reskin.models.train import train_stack
@@ -77,15 +76,6 @@ def test_scores_of_cross_validation_over_boards_equal_the_metrics_of_the_project
             assert results[f"test_{name}"][i] == sign * scores[name.removeprefix("neg_")]
 
 
-def test_scorers_skip_rows_with_unknown_places():
-    X, y = poke_rows()
-    regressor = reskin.ContactRegressor(**TITLES).fit(X, y)
-    half = np.where(np.arange(len(y))[:, None] < 24, y, np.nan)
-    for scorer in reskin.SCORERS.values():
-        assert scorer(regressor, X, half) == scorer(regressor, X[:24], y[:24])
-        assert np.isnan(scorer(regressor, X, np.full_like(y, np.nan)))
-
-
 def test_saved_network_is_loaded_as_a_model(tmp_path):
     X, y = poke_rows()
     regressor = reskin.ContactRegressor(**TITLES, inputs="shape").fit(X, y)
@@ -97,19 +87,3 @@ def test_saved_network_is_loaded_as_a_model(tmp_path):
     with pytest.raises(ParamsError, match=r"ends in .safetensors; got mine. Try: mine.safetensors"):
         regressor.save(tmp_path / "mine")
     assert {file.name for file in tmp_path.iterdir()} == {"mine.safetensors", "mine.json"}
-
-
-def test_failed_training_raises_or_warns(monkeypatch):
-    X, y = poke_rows()
-    with pytest.raises(TrainingError, match="diverged by step 4. Lower rate_max"):
-        reskin.ContactRegressor(**TITLES | {"rate_max": 1e30, "gradient_norm_max": 1e30}).fit(X, y)
-    with pytest.raises(TrainingError, match="unknown .NaN. in all rows"):
-        reskin.ContactRegressor(**TITLES).fit(X, y * [1, 1, np.nan])
-    with pytest.raises(ParamsError, match="steps_n"):
-        reskin.ContactRegressor(steps_n=0).fit(X, y)
-    with pytest.raises(ParamsError, match="random_state must be a whole number; got None"):
-        reskin.ContactRegressor(random_state=None).fit(X, y)
-    monkeypatch.setattr("reskin.models.train.CHECKED_STEPS_N", TITLES["steps_n"])
-    with pytest.warns(ConvergenceWarning, match="collapsed in all of 3 runs"):
-        constant = reskin.ContactRegressor(**TITLES).fit(np.zeros_like(X), y)
-    assert constant.network_.card["collapsed"]

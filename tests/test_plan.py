@@ -79,15 +79,6 @@ def test_each_recorded_capture_has_an_ingest_stage_of_its_own():
     assert generated["captures"] == {"lab": ["c0", "c1"]}
 
 
-def test_scene_with_many_captures_has_only_one_ingest_stage():
-    names = [f"c{i:02}" for i in range(plan.MANY_N + 1)]
-    generated = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
-    assert generated["ingest"] == {}
-    assert generated["ingest_many"] == ["lab"]
-    fewer = Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)})
-    assert make_plan({"lab": scene()}, fewer)["stages"]["ingest_many"] == []
-
-
 def test_recorded_scene_without_captures_is_an_error():
     with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
         make_plan({"lab": scene()}, Registry(captures={}))

@@ -1,4 +1,3 @@
-import copy
 from pathlib import Path
 
 import pytest
@@ -8,7 +7,7 @@ from pipeline.plan import make_plan, read_plan
 from pipeline.scenes import Scene, parse_scene, read_scene, read_shared
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
-from tests.scenes import ADAPTATIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
+from tests.scenes import ADAPTATIONS, TRAINING, check, recorded_scene, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
 ADAPTED = ("lobo", "triplet", "adapt")  # Adaptation, and the experiments that it needs.
@@ -97,39 +96,7 @@ def test_removed_experiment_may_leave_its_settings_and_its_protocol_is_not_simul
     )
 
 
-@pytest.mark.parametrize(
-    "unit",
-    ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "accuracy_and_cost"],
-)
-def test_scene_runs_only_the_stages_of_its_experiments_and_protocols(unit):
-    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
-    assert parse_scene(settings, "ci.yaml").runs(unit)
-    removed = ("drift", "variation")
-    settings["experiments"] = [
-        experiment for experiment in settings["experiments"] if experiment not in (*removed, "accuracy_and_cost")
-    ]
-    gone = {*removed, "accuracy_and_cost"}
-    settings = {name: section for name, section in settings.items() if name not in gone}
-    settings["simulate"]["protocols"].pop("wear")
-    remaining = parse_scene(settings, "ci.yaml")
-    assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))
-
-
 ALL = (*ADAPTED, "transfer", "pokes", "sensors", "new_board", "audit", "choice")
-
-
-@pytest.mark.parametrize("experiment", SPLIT_SETTINGS)
-def test_section_split_needs_only_the_settings_of_the_experiments(experiment):
-    keys, others = (
-        SPLIT_SETTINGS[experiment],
-        ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else [])),
-    )
-    with_experiment = scene_with(*others, experiment)
-    parse_scene(with_experiment, "scene.yaml")
-    for key in keys:
-        lacking = {name: value for name, value in with_experiment["split"].items() if name != key}
-        with pytest.raises(ParamsError, match=f"split lacks {key}"):
-            parse_scene(with_experiment | {"split": lacking}, "scene.yaml")
 
 
 @pytest.mark.parametrize(
@@ -164,15 +131,3 @@ def test_broken_yaml_is_an_error(tmp_path, content):
     (tmp_path / "a.yaml").write_bytes(content)
     with pytest.raises(ParamsError, match="a.yaml: the file is not valid YAML"):
         read_yaml(tmp_path / "a.yaml")
-
-
-def test_missing_file_is_an_error(tmp_path):
-    with pytest.raises(ParamsError, match="none.yaml: file not found"):
-        read_yaml(tmp_path / "none.yaml")
-
-
-def test_unknown_base_recipe_is_an_error():
-    scene = copy.deepcopy(scene_with("lobo", "triplet", "adapt"))
-    scene["adapt"]["base"] = "nope"
-    with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
-        check(scene)

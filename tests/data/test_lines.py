@@ -133,22 +133,6 @@ def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     assert max(visits_n) - min(visits_n) <= 1
 
 
-@given(st.integers(0, 2**32))
-def test_chosen_pokes_do_not_depend_on_the_order_of_rows(seed):
-    table = grid(depths_n=2)
-    order = rng_for(seed, "order").permutation(len(table))
-    shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
-    one, other = (take_pokes(rows, all_rows(rows), 80, rng_for(seed, "pokes")) for rows in (table, shuffled))
-    assert set(table.indentation[one].tolist()) == set(shuffled.indentation[other].tolist())
-
-
-def test_pokes_are_chosen_from_the_pool_only():
-    table = grid(depths_n=2, passes_n=2)
-    pool = np.flatnonzero(table.indentation >= 130)  # The pool consists of the rows of the second pass.
-    assert take_pokes(table, pool, 130, rng_for(0, "pokes")).tolist() == pool.tolist()
-    assert set(take_pokes(table, pool, 20, rng_for(0, "pokes")).tolist()) < set(pool.tolist())
-
-
 def test_each_place_and_each_of_its_visits_is_equally_likely_to_be_chosen():
     # Place 0 has 8 visits, and place 1 has one. Both places are chosen with equal probability. At place 0, all visits
     # are equally likely.

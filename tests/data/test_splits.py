@@ -127,27 +127,6 @@ def test_smaller_sets_of_sensors_are_subsets_of_larger_ones_in_the_same_draw(see
         assert board not in {skin[:2] for skin in all_of_them}
 
 
-def test_fold_with_all_sensors_equals_the_leave_one_board_out_fold():
-    table = six_by_three_in_passes(3)
-    split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
-    for fold, whole in zip(
-        draw_folds(table, ["sensors"], split, 0), draw_folds(table, ["lobo"], split, 0), strict=True
-    ):
-        assert fold.name == whole.name
-        for side in ("train", "test", "pool"):
-            np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
-
-
-def test_skins_for_training_are_drawn_independently_for_each_held_out_board():
-    table = six_by_three_in_passes(1)
-    folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
-    ranks = {
-        tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
-        for fold in folds
-    }
-    assert len(ranks) > 1  # The three skins that are drawn are not the same on all boards.
-
-
 ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
 POOL_OF_2 = Split(pool_passes_n=2)
 MANY_SENSORS = Split(sensors_skins_n=(3, 16), sensors_draws_n=1)

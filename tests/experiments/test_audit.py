@@ -284,18 +284,6 @@ def test_copy_is_detected_in_one_of_several_captures_and_in_a_sample_of_presses(
     )
 
 
-def test_fields_with_random_magnitudes_or_turned_by_ten_degrees_are_not_a_copy():
-    source_uT = ROWS.db_uT[SOURCE]
-    factor = rng_for(4, "factor").uniform(1, 4, (len(source_uT) // 2, 1)).repeat(2, axis=0)
-    assert failing(checks_of(planted(factor * source_uT))) == []
-    # Fields turn by more than 10 degrees if a skin is taken off and placed on its board again.
-    cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
-    turned_uT = source_uT.copy()
-    turned_uT[:, :14:2] = cos * source_uT[:, :14:2] - sin * source_uT[:, 1:14:2]
-    turned_uT[:, 1:14:2] = sin * source_uT[:, :14:2] + cos * source_uT[:, 1:14:2]
-    assert failing(checks_of(planted(turned_uT))) == []
-
-
 def test_weak_skins_are_named_until_the_scene_accepts_them():
     weak_uT = planted(ROWS.db_uT[TARGET] / 1000)
     check = checks_of(weak_uT)[-1]

@@ -13,12 +13,9 @@ from ruamel.yaml import YAML
 from scipy.stats import linregress, sem
 
 from pipeline.experiments import drift as experiment
-from pipeline.experiments.drift import Drift, cut, drift, figures, force_left_pct, run, summarise
-from pipeline.report import tables
-from pipeline.scores import make_table, read_scores
+from pipeline.experiments.drift import Drift, cut, figures, force_left_pct, run, summarise
+from pipeline.scores import make_table
 from pipeline.settings import Settings, read_shared_files
-from pipeline.statistics import as_json
-from reskin import io
 from reskin.data.grid import points_mm
 from reskin.data.rows import Selection
 from reskin.errors import ParamsError
@@ -230,18 +227,3 @@ def test_remaining_force_compares_readings_at_equal_places_and_depths(left, orde
 
 
 # --- Run ---
-
-
-def test_errors_are_largest_with_the_no_load_reading_from_the_start_if_the_skin_drifts(scene, tmp_path):
-    io.write_readings(tmp_path / "wear/s0-wear.parquet", [capture()], {})
-    drift(scene, SECTION, tmp_path / "wear", tmp_path / "drift.parquet", tmp_path / "results.json")
-    results = io.read_json(tmp_path / "results.json")
-    content = as_json(summarise(read_scores([tmp_path / "drift.parquet"]), results["numbers"]))
-    assert (content["skins_n"], content["seeds_n"], content["left_out_units_n"]) == (1, 2, 0)
-    last = {policy: content[policy][-1]["mse_xy_mm2"] for policy in ("initial", "regular", "each")}
-    assert last["initial"] > 2 * max(last["regular"], last["each"])
-    assert len(results["drawn"]["late"]["true_N"]) == content["late"]["indentations_n"] == 30
-    assert set(figures(content, results["drawn"], "simulated")) == {"drift.svg", "drift_force.svg"}
-    table = tables.drift({"drift": content})
-    assert table["contacts"].tolist() == ["100", "200", "300"]
-    assert all("±" in cell for cell in table["within 1 mm, % (every 20 indentations)"])

@@ -11,7 +11,7 @@ from sklearn.metrics import mean_squared_error, r2_score
 from pipeline.experiments import shear
 from pipeline.experiments.flexible import sizes_by_depth, strength_ratio
 from pipeline.experiments.manual import GRID
-from pipeline.scores import by_skin, make_table, rows_of_cards, select
+from pipeline.scores import by_skin, make_table, rows_of_cards
 from pipeline.statistics import Stat, paired
 from pipeline.training.variants import (
     AFTER,
@@ -86,19 +86,6 @@ def test_differences_equal_those_computed_from_model_cards():
     after, before = (by_skin(rows_of_cards(cards[variant])) for variant in (AFTER, BEFORE))
     result = compare_variants(TABLE, AFTER, BEFORE)
     assert result | {name: replace(result[name], sd_seeds=None) for name in METRICS} == paired(after, before)
-
-
-def scores_by_seed(variant: str, skin: str) -> np.ndarray:
-    rows = select(TABLE, method=variant, skin=skin).sort_values("seed")
-    return rows["mse_xy_mm2"].to_numpy()
-
-
-def test_differences_between_variants_are_paired_by_seed():
-    result = summarise_variants(TABLE)[AFTER]["mse_xy_mm2"]
-    assert result.sd_seeds == pytest.approx(np.mean([scores_by_seed(AFTER, skin).std(ddof=1) for skin in BOARD]))
-    result = compare_variants(TABLE, AFTER, BEFORE)["mse_xy_mm2"]
-    differences = [scores_by_seed(AFTER, skin) - scores_by_seed(BEFORE, skin) for skin in BOARD]
-    assert result.sd_seeds == pytest.approx(np.mean([one.std(ddof=1) for one in differences]))
 
 
 @given(st.floats(0.5, 3))

@@ -21,7 +21,6 @@ from pipeline.experiments.new_board import (
     draw_presses,
     score_contact,
     score_draw,
-    spaced,
     splits_of,
     summarise,
     tabulate_draws,
@@ -160,11 +159,6 @@ def test_a_row_is_reproduced_by_the_public_interface_from_a_saved_draw():
     expected = score(readings.target, model.predict(readings.b_uT))
     assert {name: row[name] for name in expected} == expected
     assert {row["labels_n"] for row in rows} == {0, 1, 10}
-
-
-def test_tested_readings_are_evenly_spaced_over_their_press():
-    press_i = np.array([0] * 9 + [1] * 2 + [2] * 3)
-    assert spaced(press_i, 3).tolist() == [0, 4, 8, 9, 10, 11, 12, 13]
 
 
 def test_coverage_is_the_percentage_of_true_values_inside_the_intervals():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import linregress, norm, spearmanr
+from scipy.stats import linregress, spearmanr
 
 from pipeline.experiments.results import group_by_level
 from pipeline.experiments.sensitivity import (
@@ -17,7 +17,6 @@ from pipeline.experiments.sensitivity import (
     direction,
     monotonic,
     ordered_share,
-    smallest_step_N,
 )
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
@@ -74,12 +73,6 @@ def test_direction_of_the_response_is_fitted_to_the_first_half_of_fillings():
     assert analyse_levels(swapped_uT, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
-def test_smallest_resolved_step_is_the_one_above_which_all_steps_are_resolved():
-    assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
-    assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
-    assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
-
-
 def two_fillings(values, spread):
     """Return readings of two fillings with levels 0.1 N apart.
 
@@ -109,31 +102,6 @@ def test_number_of_falls_and_rank_correlation_equal_loops_and_scipy(values, spre
     assert found["holds"] == (found["falls_n"] == 0 and "step_N" in found)
     assert found["neighbours"]["falls_n"] == sum(after <= before for before, after in pairwise(values))
     assert found["spearman"] == pytest.approx(spearmanr(np.arange(len(values)), values).statistic)
-
-
-def test_verdict_on_monotonicity_does_not_depend_on_the_size_of_filling_steps():
-    fine_N = 0.002 * np.arange(251)  # These weights have the same range as WEIGHT_N, but a tenth of its step.
-    noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
-    fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
-    pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
-    found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
-    # With the small steps, the mean rise per level is 0.6 uT, and its noise is 5 sqrt(2 / 100) = 0.7 uT. Some falls
-    # between neighbouring levels are therefore due to noise.
-    assert found["neighbours"]["falls_n"] > 0
-    assert found["holds"]
-    assert coarse["holds"]
-    assert found["step_N"] <= coarse["step_N"] == pytest.approx(0.02)
-
-
-def test_number_of_falls_caused_by_noise_equals_the_expected_number():
-    rng = rng_for(0, "falls")
-    rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
-    response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
-    found = monotonic(response_uT, 0.01 * np.arange(2001))["neighbours"]
-    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # This is 576 falls.
-    # The tolerance allows for the estimate of the noise, which has an error of 1 %.
-    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)
-    assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 
 
 def test_readings_are_sorted_by_filling_and_weight():

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error
 
 from pipeline.experiments.sleeve import (
-    NEAR_MM,
     errors_mm,
     hold_out_last,
     lay_out,
@@ -65,12 +64,6 @@ def test_borders_and_chips_of_two_by_four_boards_are_at_the_designed_places():
     # These are the centre chip and the right chip of board 0.
     np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])
     np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
-
-
-@given(st.floats(0, 50.8), st.floats(0, 101.6))
-def test_place_is_near_a_border_if_any_border_is_near(x_mm, y_mm):
-    to_border_mm = min(abs(x_mm - 25.4), *(abs(y_mm - border_mm) for border_mm in AREA.borders_mm[1]))
-    assert AREA.near_border(np.array([[x_mm, y_mm]]))[0] == (to_border_mm < NEAR_MM)
 
 
 @given(st.lists(st.integers(6, 40), min_size=1, max_size=3), st.floats(0.1, 0.9))

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.experiments.variation import (
     Variation,
@@ -81,15 +79,6 @@ def test_change_over_time_is_between_the_first_and_the_last_visit_within_the_lim
         "db_change_uT": pytest.approx(2**0.5), "db_change_pct": pytest.approx(50 * 2**0.5),
     }  # fmt: skip
     assert plotted == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
-
-
-@given(st.floats(-500, 500), st.floats(0.5, 3))
-def test_drift_changes_raw_readings_but_not_field_changes(drift_uT, scale):
-    db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
-    rest_uT = drift_uT * np.arange(5)[:, None]
-    numbers, _ = over_time(Visits(np.arange(5), db_uT + rest_uT, scale * db_uT), 100)
-    assert numbers["raw_change_uT"] == pytest.approx(4 * abs(drift_uT), abs=1e-9)
-    assert numbers["db_change_uT"] == 0
 
 
 def test_spread_between_skins_is_the_rms_difference_over_all_pairs_of_skins():

@@ -19,9 +19,8 @@ from pipeline.scenes import read_scene
 from pipeline.settings import read_settings
 from pipeline.training.board_model import read_layout_of
 from pipeline.training.recorded import Compare
-from reskin import config
 from reskin.board.wire import encode
-from reskin.errors import CaptureError, ReskinError
+from reskin.errors import ReskinError
 from reskin.layouts import FOLDER
 from reskin.recordings import preparing, probe
 from reskin.recordings.header import Clock, write_capture
@@ -102,30 +101,6 @@ def test_added_recording_is_tracked_by_dvc_and_is_in_the_registry_and_the_plan(r
     assert not list((root / "data/raw").rglob("*readings*"))
 
 
-@pytest.mark.parametrize(
-    "found", ["Compared with the scene, chips 1 and 2 are swapped.", None, CaptureError("no places")]
-)
-def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
-    root, lab_file, monkeypatch, capsys, found
-):
-    def find_departure(*_: object) -> str | None:
-        if isinstance(found, CaptureError):
-            raise found
-        return found
-
-    monkeypatch.setattr("pipeline.fitting.frames.find_departure", find_departure)
-    arguments = recorded_scene()
-    arguments["experiments"] = [*arguments["experiments"], "compare"]
-    arguments["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
-    with (root / SCENES / "small.yaml").open("w") as stream:
-        YAML().dump(arguments, stream)
-    add_lab(root, lab_file)
-    assert "board1_skin1_readings" in read_registry(root).captures["small"]
-    stderr = capsys.readouterr().err
-    assert ("warning: capture board1_skin1_readings: " in stderr) == (found is not None)
-    assert str(found or "") in stderr
-
-
 def test_recording_with_repeated_readings_is_added_with_a_warning(root, tmp_path, capsys):
     """If a recorder reads faster than the chips convert, it writes each reading twice."""
     press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
@@ -179,27 +154,10 @@ def test_folder_left_by_a_killed_add_is_reported(root, lab_file):
     assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed before")
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
-def test_invalid_rate_is_an_error(root, tmp_path, rate_hz):
-    for name in ("dump.bin", "probe.csv"):
-        (tmp_path / name).write_bytes(b"")
-    what = {"wire": "binary", "chips_n": 2, "rate_hz": rate_hz, "probe": tmp_path / "probe.csv"}
-    assert_refused(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), **what), "--rate-hz")
-
-
 @pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1", "1.2.3,1", "1_0,2", "\u0663,2"])
 def test_invalid_mark_is_an_error(text):
     with pytest.raises(ReskinError, match="--mark: a mark must be STREAM_S,PROBE_S"):
         preparing.parse_marks([text])
-
-
-def test_capture_without_labels_is_an_error(tmp_path):
-    folder = tmp_path / "run1"
-    clock = Clock(kind="rate", rate_hz=400.0, marks=())
-    header = make_header(capture="run1", layout="native", wire="binary", chips_n=2, clock=clock)
-    write_capture(folder, header, {"stream.bin": encode(FRAMES, "binary")})
-    with pytest.raises(CaptureError, match="no labels. Add --probe .* or record with --labels"):
-        preparing.native(folder, labels(), None, ())
 
 
 @pytest.mark.parametrize(

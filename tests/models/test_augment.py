@@ -19,12 +19,6 @@ def augmentation(**changes: float) -> Augmentation:
     return Augmentation.model_validate({"copies_n": 3, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0} | changes)
 
 
-def test_virtual_boards_without_spread_have_unchanged_readings():
-    copies, skin = virtual_boards(rows(), SKIN, augmentation(), rng_for(1, "draw"))
-    np.testing.assert_array_equal(copies, np.tile(rows(), (3, 1)))
-    assert len(np.unique(skin)) == 2 * 3
-
-
 def test_tilt_rotates_the_field_of_each_chip_and_keeps_its_length():
     copies, _ = virtual_boards(rows(), SKIN, augmentation(lean_sd_deg=20.0), rng_for(1, "draw"))
     before, after = (np.linalg.norm(values.reshape(-1, 2, 3), axis=2) for values in (np.tile(rows(), (3, 1)), copies))

@@ -88,14 +88,6 @@ def test_rows_are_drawn_with_equal_probability():
     assert (np.abs(np.bincount(rows, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()
 
 
-def test_batches_of_a_network_do_not_depend_on_other_networks_of_the_stack():
-    (alone, beside) = (
-        batches(jobs) for jobs in ([some_job(1, terms=True)], [some_job(i, terms=True) for i in range(3)])
-    )
-    for one, other in zip(alone, beside, strict=True):
-        assert all(torch.equal(one[name][0], other[name][1]) for name in one)
-
-
 def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
     """Methods are compared on equal batches.
 

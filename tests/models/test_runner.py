@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.executors import make_executor
-from reskin import io
 from reskin.errors import ReskinError
 from reskin.models import train
 from reskin.models.batches import prepare
@@ -95,21 +94,6 @@ def test_result_of_a_job_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
-def test_each_set_of_rows_is_written_once_for_all_workers(tmp_path, monkeypatch):
-    sent, written = [], []
-    here, write = InlineExecutor(), io.write_tensors
-    monkeypatch.setattr(
-        here, "submit", lambda fn, *args: (sent.append(args), InlineExecutor.submit(here, fn, *args))[1]
-    )
-    monkeypatch.setattr(
-        io, "write_tensors", lambda file, tensors, of: (written.append(tensors), write(file, tensors, of))
-    )
-    run([replace(job, seed_i=seed_i) for job in jobs(2) for seed_i in (0, 1)], tmp_path, here)
-    assert {job.train.size + job.test.size for _, stack, _ in sent for job, *_ in stack} == {0}
-    # Three arrays are shared by all jobs: fields, targets and skins. Four are the training and test rows of two folds.
-    assert len(written[0]) == 3 + 4
-
-
 def test_jobs_that_finished_before_a_run_was_killed_are_kept(tmp_path):
     selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
@@ -149,36 +133,12 @@ def test_finished_jobs_are_read_from_the_cache(tmp_path):
     assert log == ["3 of 3 training runs were finished before and are not repeated"]
 
 
-@pytest.mark.parametrize(
-    ("more", "trained_n"),
-    [
-        (replace(jobs(1)[0], seed_i=1), 1),
-        (jobs(1, steps_n=5)[0], 1),
-        (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # This is a job of another fold. It changes which jobs are in the stack.
-    ],
-    ids=["seed", "schedule", "terms", "fold"],
-)
-def test_adding_a_job_trains_only_the_stack_of_the_new_job(tmp_path, more, trained_n):
-    run(jobs(2), tmp_path)
-    assert trainings_n([*jobs(2), more], tmp_path) == 1
-    assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
-
-
 def test_equal_jobs_are_trained_only_once(tmp_path):
     one = jobs(1)[0]
     selected = [one, replace(one, recipe_name="twin"), one]
     done = run(selected, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     assert all(equal_results(done[0], other) for other in done[1:])
-
-
-@pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_result_written_to_the_cache_is_read_unchanged(tmp_path, job):
-    (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
-    assert equal_results(direct, read)
-    assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
-    assert read.stopped_step is direct.stopped_step is None
 
 
 # With these weights, all ReLUs are 0, so the output is constant and there is no gradient.
@@ -252,16 +212,3 @@ def test_each_job_is_in_exactly_one_stack(kinds, size_n):
     counts = [kinds.count(kind) for kind in set(kinds)]
     # There are as few stacks as the limit on their size allows.
     assert len(found) == sum(-(-count // size_n) for count in counts)
-
-
-def test_network_with_five_targets_learns_all_of_them():
-    data = example_data()
-    shear_N = data.target[:, 2:] * np.array([0.5, -0.25], np.float32)
-    five = replace(data, target=np.hstack([data.target, shear_N]))
-    many = replace(without_triplets(), recipe=recipe(steps_n=400))
-    (one,) = train_stack([replace(many, test=many.train)], five)
-    assert one.predicted.shape == (len(many.train), 5)
-    # Predictions are for training data, which the network overfits. The two shear forces are proportional to the third
-    # target.
-    rms_N = np.sqrt(((one.predicted - five.target[many.train]) ** 2).mean(axis=0))
-    assert (rms_N < 0.5 * five.target.std(axis=0)).all()

@@ -103,24 +103,6 @@ def test_field_memory_of_a_press_is_5_to_8_percent_and_decays():
     assert (np.diff(left[1:]) < 0).all()
 
 
-def test_field_memory_is_unchanged_by_stops_of_the_tip_above_the_skin():
-    stops_T = np.zeros((2, 4, 1, 3))
-    # Each press has four stops of the tip. At the first, second and fourth stop, the tip is above the skin, so the
-    # field does not change. At the third stop, it presses.
-    stops_T[:, 2] = 1e-3
-    _, added_T = field_memory(stops_T, MEMORY)
-    assert not added_T[0, :2].any()
-    assert (added_T[0, 2:] > 0).all()
-    # For comparison: a press with a single stop, whose field change is the mean over these four stops.
-    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)
-    np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, MEMORY)[1][0, 0])
-
-
-def test_memory_shares_without_time_constants_are_refused():
-    with pytest.raises(ValueError, match="one time for each share"):
-        Memory(share=(0.1,), tau_s=(1.0, 2.0), contact_s=1.0, rest_s=1.0)
-
-
 DESIGN = {"settling": 0.10, "ageing": 0.01}
 
 

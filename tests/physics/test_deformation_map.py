@@ -63,12 +63,6 @@ def test_tabulated_motion_equals_the_computed_motion_of_nodes(rung_i, share, bas
         )
 
 
-@pytest.mark.parametrize("base", BASES)
-@pytest.mark.parametrize("depth_m", [0.0, -0.3e-3])
-def test_poke_without_contact_moves_no_node(depth_m, base):
-    assert move(places(np.random.default_rng(2), 100), (1e-3, 1e-3, depth_m), base).i.size == 0
-
-
 def test_displacement_beyond_the_range_of_the_table_is_negligible():
     radius_m = layer.contact_of_depth(1.2e-3, thickness_m=H_M, tip_radius_m=TIP_M, base="bonded").radius_m
     assert table().reach_m == pytest.approx(radius_m + 5 * H_M, rel=0.01)

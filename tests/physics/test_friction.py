@@ -55,17 +55,6 @@ def test_tangential_force_is_never_above_the_friction_limit(path_m, mu, data):
     np.testing.assert_allclose(found.force_N, stiffness[:, None] * found.elastic_m, rtol=ROUNDING, atol=1e-300)
 
 
-@given(st.lists(st.floats(0, 1), max_size=20), st.floats(1e-4, 5e-3), frictions)
-def test_subdividing_a_straight_path_does_not_change_the_force(cuts, end_m, mu):
-    ahead = np.array([0.6, -0.8])
-    fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
-    ends = [
-        drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu).force_N[-1]
-        for path_m in (fine_m, fine_m[[0, -1]])
-    ]
-    np.testing.assert_allclose(*ends, atol=ROUNDING)
-
-
 def test_loop_dissipates_friction_force_times_sliding_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
     # The spring's greatest length of 0.8 mm is a whole number of steps of 10 um. Therefore sticking changes to sliding
@@ -87,12 +76,6 @@ def test_loop_dissipates_friction_force_times_sliding_length():
     # If the tip starts at rest, the work equals the dissipated energy plus the energy that is stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
-
-
-def test_tangential_force_falls_with_the_normal_force():
-    path_m = np.array([[0.0, 0.0], [2e-3, 0.0], [2e-3, 0.0], [2e-3, 0.0]])
-    found = drag_force(path_m, np.array([1.0, 1.0, 0.25, 1.0]), stiffness_N_per_m=K, friction=0.8)
-    np.testing.assert_allclose(found.force_N[:, 0], [0, 0.8, 0.2, 0.2], rtol=ROUNDING)
 
 
 def test_lifting_the_tip_relaxes_the_spring():

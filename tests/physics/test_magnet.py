@@ -40,26 +40,6 @@ def test_field_of_the_array_equals_magpylib_and_satisfies_maxwells_equations(pol
     assert laws.maxwell(THICKNESS_M, polarity, seed) <= LIMITS["maxwell"]
 
 
-@pytest.mark.parametrize(("side_mm", "n"), [(20.0, 4), (25.4, 4), (50.8, 8), (101.6, 16), (101.7, 17), (3.0, 1)])
-def test_magnets_cover_a_side_of_the_skin_symmetrically(side_mm, n):
-    side_m = 1e-3 * side_mm
-    assert magnet.cubes_along(side_m) == n
-    seams_m = magnet.seams_m(side_m)
-    assert len(seams_m) == n - 1
-    np.testing.assert_allclose(seams_m, [-s for s in reversed(seams_m)], atol=1e-18)
-    np.testing.assert_allclose(np.diff(seams_m), magnet.CUBE_SIDE_M)
-    assert np.abs(seams_m).max(initial=0) < side_m / 2
-
-
-@given(places_m, polarities)
-def test_reflected_array_of_magnets_has_the_reflected_field(point_m, polarity):
-    # The reflection x -> -x maps the magnetic charges of equal poles to equal charges, so only Bx changes sign. On a
-    # checkerboard, it exchanges the poles, so the charges change sign as well.
-    sign = -1 if polarity == "checkerboard" else 1
-    here_T, there_T = (magnet.array_field((point_m * (side, 1, 1))[None], THICKNESS_M, polarity)[0] for side in (1, -1))
-    np.testing.assert_allclose(there_T, sign * here_T * (-1, 1, 1), atol=1e-12)
-
-
 def test_field_of_the_array_equals_the_specification():
     # The specified field in the slab is 0.38 to 0.65 T. The field is weaker at places where seams between magnets
     # cross, and stronger at the faces of the magnets.

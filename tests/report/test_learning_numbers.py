@@ -104,24 +104,6 @@ def test_paired_differences_are_averaged_over_the_skins_of_each_board():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_methods_multi_and_single_are_compared_on_skins_on_which_both_were_tested():
-    single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
-    (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
-    assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}
-    assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
-
-
-def test_protocol_counts_the_data_for_training_and_for_tests():
-    counts = numbers(board_cards("lobo", 80.0))["protocol"]
-    assert counts.keys() == {"lobo"}
-    cards = board_cards("lobo", 80.0)
-    assert counts["lobo"]["folds_n"] == len({one["fold"] for one in cards})
-    assert counts["lobo"]["seeds_n"] == len({one["seed_i"] for one in cards})
-    assert counts["lobo"]["skins_n"] == len({skin for one in cards for skin in one["scores"]["by_skin"]})
-    assert counts["lobo"]["trained_on_skins_n"] == len(cards[0]["train_skins"])
-    assert counts["lobo"]["trained_on_rows_n"] == cards[0]["train_rows_n"]
-
-
 def test_sweep_over_the_number_of_pokes_is_sorted():
     points = [
         *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((390, "s2", 90.0), (390, "s3", 94.0))),

@@ -4,7 +4,6 @@ import re
 import shutil
 from html.parser import HTMLParser
 
-import pandas as pd
 import pytest
 
 from pipeline.report import page
@@ -67,23 +66,6 @@ def test_page_shows_the_numbers_of_the_scene():
     numbers["table2"]["adapted"]["accuracy_pct"] = {"mean": 71.64, "n": 6, "ci95": [61.4, 79.3]}
     html = scene_page(numbers, {}, figures_of("*.md"))
     assert "72 [61, 79] %" in html
-
-
-def test_tables_and_figures_that_no_section_names_are_shown_at_the_end():
-    numbers = io.read_json(ROOT / "reports/quick/numbers.json")
-    html = scene_page(numbers, {"mine": pd.DataFrame({"<a>": ["<b>"]})}, figures_of("*.md") | {"own.svg": SVG})
-    assert 'id="own"' in html
-    assert "&lt;b&gt;" in html
-    assert "<b>" not in html
-
-
-def test_ids_of_figures_stay_unique():
-    filled = Page({}, {}, {"a": SVG, "b": SVG})
-    for name in ("a", "b"):
-        filled.figure(name, "")
-    assert all(
-        f'id="{name}-p"' in part and f"url(#{name}-p)" in part for name, part in zip("ab", filled.parts, strict=True)
-    )
 
 
 def test_name_that_does_not_exist_is_an_error_that_names_the_file(tmp_path, monkeypatch):

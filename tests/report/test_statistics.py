@@ -17,22 +17,17 @@ from pipeline.scores import (
     make_table,
     read_scores,
     rows_of_cards,
-    select,
     to_csv,
     whole,
     write_scores,
 )  # fmt: skip
 from pipeline.statistics import (
-    Stat,
-    add_seed_sd,
     holm,
     interval,
     over_boards,
     over_folds,
-    over_pairs,
     paired,
     paired_with_single,
-    t_interval,
     two_way_error,
 )
 from reskin.data.splits import Split, draw_folds
@@ -87,14 +82,6 @@ def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
     assert summary.sd == pytest.approx(14 / 2**0.5)
     assert summary.sd_seeds == pytest.approx(8**0.5)
     assert over_folds(rows_of_cards(cards[:2]))["mse_xy_mm2"].sd is None
-
-
-def test_standard_deviation_over_seeds_is_computed_within_each_board():
-    rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
-    found = add_seed_sd({"accuracy_pct": Stat(5.5, 2)}, rows, "board", "skin")["accuracy_pct"]
-    assert found == Stat(5.5, 2, sd_seeds=float(np.mean([2**0.5, 0])))
-    alone = {"accuracy_pct": Stat(8.0, 1)}
-    assert add_seed_sd(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
 def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
@@ -282,34 +269,6 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
             name != "r2_f"
         ):  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
             assert stat.values == pytest.approx(means)
-
-
-def test_scores_of_several_draws_are_averaged_within_each_board():
-    cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
-    assert over_boards(rows_of_cards(cards)) == over_boards(rows_of_cards(adapted_cards()))
-    alone = over_boards(rows_of_cards([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
-    assert alone.n == 1
-    assert alone.ci95 is None
-    assert alone.sd_seeds > 0
-
-
-def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins():
-    rng = rng_for(0, "transfer")
-    tested = [f"b{i}" for i in range(1, 5)]
-    boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
-    cards = []
-    for fold in ("b0_s0", "b5_s0", "b6_s0"):
-        true = rng.uniform(0, 16, (80, 3))
-        scores = score_groups(true, true + rng.normal(0, 2, true.shape), boards, skins)
-        cards.append(card("transfer", fold, scores))
-    stat = over_pairs(rows_of_cards(cards))["mse_xy_mm2"]
-    assert (stat.n, stat.training_n, stat.boards_n) == (3 * 8, 3, 4)
-    table = pd.DataFrame(
-        [[np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for i in range(2)]) for board in tested]
-         for one in cards]
-    )  # fmt: skip
-    assert stat.ci95 == pytest.approx(t_interval(float(table.to_numpy().mean()), *two_way_error(table), "mse_xy_mm2"))
-    assert stat.ci95[0] > 0
 
 
 def test_experiment_transfer_tests_each_skin_on_the_same_rows_as_experiment_lobo():

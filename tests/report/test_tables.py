@@ -160,13 +160,6 @@ def test_table_2_has_the_papers_numbers_and_a_control():
     assert table["model"].tolist()[:4] == list(paper.TABLE_2_ROWS.values())
 
 
-@pytest.mark.parametrize(("step_N", "shown"), [(0.01, "≤ 0.01"), (0.03, "0.03"), (None, "none up to 1")])
-def test_finest_step_of_weight_is_an_upper_bound(step_N, shown):
-    found = committed("paper")["sensitivity"] | {"step_N": 0.01}
-    found["smallest_step_N"] = {"one_reading": step_N} if step_N else {}
-    assert tables.sensitivity({"sensitivity": found})["ours"][0] == shown
-
-
 @given(
     mean=st.floats(-200, 200),
     half=st.floats(1e-4, 100),
@@ -183,9 +176,3 @@ def test_number_of_digits_of_a_score_follows_from_its_uncertainty(mean, half, as
     assert digits <= 3  # There are two digits, or three if an end of the interval would otherwise be rounded to 0.
     # There are fewer digits only if the mean already has four digits.
     assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10
-
-
-def test_end_of_an_interval_is_not_rounded_to_zero():
-    assert show({"mean": 2.09, "n": 6, "ci95": [0.0134, 4.17]}) == "2.09 [0.01, 4.17]"
-    # In this case, no number of digits would help.
-    assert show({"mean": 0.0335, "n": 6, "ci95": [-2e-5, 0.067]}) == "0.034 [0.000, 0.067]"

@@ -103,27 +103,6 @@ def test_labels_have_the_commanded_place_and_the_measured_force(capture):
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
-def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
-    # Only frames without motion are compared, because while the tip moves down, chips that convert earlier read a
-    # smaller field change.
-    without_motion = [1, 2, 3, 4, 8, 9, 10]
-    b_uT = frames_by_indentation(capture)[:, without_motion]
-    differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
-    # The standard error for 7000 draws is 0.8 %.
-    np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)
-
-
-def test_protocol_may_state_another_frame_rate():
-    slow, usual = (
-        capture_of(with_protocol("other", GRID | {"passes_n": 1} | rate), "other") for rate in ({"rate_hz": 133.0}, {})
-    )
-    for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
-        frames_n, log = 130 * FRAMES_N, capture.probe
-        # Tolerance: a chunk arrives a few tenths of a millisecond late; the capture lasts 3 s or more.
-        assert capture.arrived_s[-1] == pytest.approx(frames_n / rate_hz, rel=1e-3)
-        np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
-
-
 SLEEVE = {
     "letter": "v", "boards_n": 1, "skins_per_board_n": 1,
     "design": RIGID | {"tiles": {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}},

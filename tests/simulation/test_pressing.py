@@ -15,9 +15,7 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import simulate_capture, to_files
 from reskin.simulation.protocols import (
     Press,
-    Walk,
     depths_under_load,
-    half_sine,
 )
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.simulation.scene import synthesis, with_protocol
@@ -43,11 +41,6 @@ def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
-def test_weight_that_is_too_heavy_for_the_skin_is_refused():
-    with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, the force at the greatest depth"):
-        depths_under_load(SKIN, np.array([[1e4]]))
-
-
 def test_labels_of_a_filling_are_weights_and_no_depths():
     capture = capture_of("glass", GLASS)
     log = capture.probe
@@ -56,26 +49,6 @@ def test_labels_of_a_filling_are_weights_and_no_depths():
     # The tolerance is six standard deviations.
     np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)
     assert set(log.x_mm[log.contact]) == {8.0}
-
-
-def test_half_sine_press_is_symmetric_in_time():
-    depth_mm = half_sine(101, 0.8)
-    assert depth_mm.argmax() == 50
-    assert depth_mm[50] == pytest.approx(0.8)
-    np.testing.assert_allclose(depth_mm, depth_mm[::-1], atol=1e-12)
-    # The tolerance is the error of the midpoint rule, (pi / 2 n)^2 / 6.
-    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)
-
-
-def test_walk_has_the_given_number_of_footfalls_of_limited_duration():
-    plan = Walk(**WALK | {"steps_n": 40, "terms": ()}).plan(rng_for(0, "walk"), SKIN_MM)
-    down = plan.depth_mm[0] > 0
-    edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))
-    stance_n = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
-    assert len(stance_n) == 40
-    assert stance_n.min() >= 50
-    assert stance_n.max() <= 125
-    assert not down[-50:].any()
 
 
 def test_frames_in_contact_form_dwells():

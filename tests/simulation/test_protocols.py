@@ -10,11 +10,10 @@ from reskin.config import parse
 from reskin.data.grid import SKIN_MM, points_mm
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import Drag, Grid, Hand, Scatter
+from reskin.simulation.protocols import Grid, Hand, Scatter
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
 GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)
-DRAG = Drag(kind="drag", passes_n=1, depths_mm=(0.6, 1.2), step_mm=1.0, **SHARED)
 HAND = Hand(
     kind="hand", lines_n=13, pokes_per_line_n=25, depth_mm=(0.4, 1.2), place_sd_mm=0.3, tilt_sd_deg=5.0, **SHARED
 )
@@ -29,18 +28,6 @@ def test_grid_pass_has_390_indentations():
     assert plan.x_mm.shape == (2 * 390, 1)
     np.testing.assert_array_equal(np.hstack([plan.x_mm, plan.y_mm])[:65], points_mm())
     np.testing.assert_array_equal(plan.pass_i, np.repeat([0, 1], 390))
-
-
-def test_every_second_pass_drags_backwards():
-    one, two = plan_of(DRAG), plan_of(DRAG.model_copy(update={"passes_n": 3}))
-    n = len(one)
-    for name in ("x_mm", "y_mm"):
-        first, back, third = np.split(getattr(two, name), [n, 2 * n])
-        np.testing.assert_array_equal(first, getattr(one, name))
-        np.testing.assert_array_equal(back, first[:, ::-1])
-        np.testing.assert_array_equal(third, first)
-    np.testing.assert_array_equal(two.depth_mm, np.tile(one.depth_mm, (3, 1)))
-    np.testing.assert_array_equal(two.pass_i, np.repeat([0, 1, 2], n))
 
 
 def test_hand_protocol_has_325_pokes_without_labels():

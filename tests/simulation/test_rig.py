@@ -75,16 +75,6 @@ def test_dwells_in_the_log_contain_the_frames_of_their_stops(protocol):
     np.testing.assert_array_equal(log.contact, np.tile([False] + [True] * stops_n, len(one)))
 
 
-def test_log_has_every_stop_of_a_line():
-    one = plan(DRAG)
-    force_N = rng_for(0, "force").standard_normal((len(one), 6, 3))
-    log = probe_log(one, force_N, rig(), (0.0, 1.0))
-    np.testing.assert_allclose(log.x_mm[log.contact].reshape(one.x_mm.shape), one.x_mm)
-    np.testing.assert_allclose(log.Fy_N, force_N[:, :, 1].ravel().astype(np.float32))
-    assert not log.depth_mm[~log.contact].any()
-    np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
-
-
 def test_position_errors_of_the_robot_have_the_given_standard_deviations():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))

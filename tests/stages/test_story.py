@@ -16,13 +16,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import mlflow
 import numpy as np
 import pandas as pd
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
-from ruamel.yaml import YAML
 
 from pipeline.catalogue import ANALYSES
 from reskin import io
@@ -85,21 +83,6 @@ def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
     assert set(scores) == {"table2", "single_sensor", "shear", "new_board"}
     assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted"}
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
-
-
-def test_protocols_are_simulated_into_separate_folders(story):
-    names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
-    for folder, capture in names.items():
-        assert [file.stem for file in (story / "data/indentations" / folder).glob("*.parquet")] == [capture]
-    hand, drag, wear = (
-        io.read_readings(story / f"data/indentations/ci-{protocol}/b0_s0-{protocol}.parquet")
-        for protocol in ("hand", "drag", "wear")
-    )
-    assert np.isnan(hand.x_mm).all()
-    assert np.isnan(hand.Fz_N).all()
-    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # there is a stop every 2 mm along a line
-    assert np.abs(drag.Fx_N).max() > 0.3  # dragging along x causes friction
-    assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
 def test_experiments_on_many_skins_have_scores_for_each_board(story, numbers):
@@ -177,22 +160,6 @@ def test_only_provenance_and_the_page_of_the_run_depend_on_commit_machine_and_ti
     assert changed == {"ci/provenance.json", "ci/run.html"}
 
 
-def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(story, numbers):
-    for experiment in ("manual", "flexible"):
-        assert numbers[experiment]["seeds_n"] == 2
-        assert all(
-            "sd_seeds" in numbers[experiment][variant]["accuracy_pct"] for variant in ("before", "after", "control")
-        )
-        assert "sd_seeds" in numbers[experiment]["paired"]["after_minus_before"]["accuracy_pct"]
-    assert numbers["shear"]["seeds_n"] == numbers["drift"]["seeds_n"] == numbers["logs"]["networks_n"] == 2
-    assert all("sd_seeds" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
-    assert "mse_f_N2" in numbers["logs"]["spread"]
-    assert {"mean", "sd", "n"} == set(numbers["sleeve"]["accuracy_pct"])
-    assert numbers["sleeve"]["accuracy_pct"]["n"] == 2
-    for policy in ("initial", "regular", "each"):
-        assert all("mse_f_N2" in row["spread"] for row in numbers["drift"][policy])
-
-
 def test_reskin_predict_estimates_contacts_from_a_log_of_an_sd_card(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
@@ -245,22 +212,6 @@ def test_saved_predictions_equal_those_computed_from_the_saved_weights(story):
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
-def test_mlflow_runs_have_the_duration_and_the_loss_curve_of_their_training(story):
-    client = mlflow.MlflowClient(f"sqlite:///{story / 'mlflow.db'}")
-    query = "tags.kind = 'training' and params.method = 'multi'"
-    found = client.search_runs([client.get_experiment_by_name("ci").experiment_id], query)
-    timed = json.loads((story / ".reskin/seconds/ci/train_multi.json").read_text())
-    seconds = {training["name"]: training["train_s"] for training in timed}
-    assert {training.info.run_name for training in found} == set(seconds)
-    for training in found:
-        name = training.info.run_name
-        assert (training.info.end_time - training.info.start_time) / 1e3 == pytest.approx(seconds[name], abs=0.002)
-        card = json.loads((story / f"data/models/ci/train_multi/{name}.json").read_text())
-        curve = client.get_metric_history(training.info.run_id, "loss")
-        assert [point.step for point in curve] == card["curve_steps"]
-    assert client.get_model_version_by_alias("reskin-ci", "champion")
-
-
 def test_dvc_repro_restores_deleted_models_without_running_stages(story):
     models = sorted((story / "data/models/ci/train_multi").iterdir())
     content = models[0].read_bytes()
@@ -302,23 +253,6 @@ def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 training runs were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6
-
-
-@slow
-def test_report_has_nothing_of_a_removed_experiment(story, run_stages):
-    scene = story / "pipeline/scenes/ci.yaml"
-    settings = YAML(typ="safe").load(scene.read_text())
-    settings["experiments"].remove("sleeve")  # its settings stay
-    with scene.open("w") as stream:
-        YAML().dump(settings, stream)
-    run(story, "reskin", "scenes", "use", "ci")
-    assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
-    run_stages("report@ci")
-    assert list(story.glob("reports/ci/**/*sleeve*")) == []
-    numbers = json.loads((story / "reports/ci/numbers.json").read_text())
-    assert "sleeve" not in numbers
-    provenance = json.loads((story / "reports/ci/provenance.json").read_text())
-    assert not any("sleeve" in unit for unit in provenance["runtime"]["stages"])
 
 
 def test_unknown_parameter_is_reported_without_traceback(story, run_stages):

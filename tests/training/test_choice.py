@@ -94,32 +94,6 @@ def test_scores_of_adapted_skins_are_averaged_over_boards():
     assert scores.sd_seeds is None  # The spread over skins is not a spread over seeds.
 
 
-SHAPED = {"inputs": "shape"}
-
-
-@pytest.mark.parametrize(
-    "better",
-    [
-        card("lobo", "shaped", 0.001, recipe=RECIPE | SHAPED),
-        card("triplet", "shaped", 0.001, recipe=RECIPE | SHAPED),
-        adapted_card("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
-        card("single_random", "single", 0.001),
-    ],
-    ids=["shape", "triplet shape", "adapted shape", "another experiment"],
-)
-def test_networks_with_other_inputs_or_experiments_are_not_candidates(better):
-    assert choose([better, *CARDS]) == choose(CARDS)
-
-
-def test_chosen_settings_exclude_the_number_of_steps_and_the_base_network():
-    for one in choose(CARDS).values():
-        assert "steps_n" not in one["settings"]
-        assert "base" not in one["settings"]
-    chosen = choose(CARDS)
-    assert {*chosen["train_multi"]["settings"]} == {*RECIPE} - {"steps_n"}
-    assert {*chosen["adapt"]["settings"]} == {"batch_n", "rate_max", "weight_decay", "unlabelled_weight"}
-
-
 @pytest.mark.parametrize(
     ("cards", "stage"),
     [
