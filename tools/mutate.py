@@ -142,7 +142,8 @@ def draw(paths: Iterable[Path], n: int, seed: int) -> list[Mutant]:
 
 def tests_of(path: Path) -> list[str]:
     """Return the test files of a module: those that import it, then the others of the same folder."""
-    words = rf"\b(from {'.'.join(path.parent.parts)} import .*\b{path.stem}\b|{'.'.join(path.with_suffix('').parts)}\b)"
+    module = path.parent if path.stem == "__init__" else path.with_suffix("")
+    words = rf"\b(from {'.'.join(module.parent.parts)} import .*\b{module.name}\b|{'.'.join(module.parts)}\b)"
     files = sorted((ROOT / "tests").rglob("test_*.py"))
     folder = Path("tests", *path.parent.parts[1:2])
     near = [file for file in files if file.relative_to(ROOT).parent.is_relative_to(folder)]

@@ -21,6 +21,7 @@ from pipeline.report.claims import (
     evaluate,
     judge,
     read_claims,
+    resolve,
 )
 from pipeline.statistics import p_value_of, statistic
 from reskin.errors import ParamsError, SchemaError
