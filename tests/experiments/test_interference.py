@@ -9,7 +9,7 @@ import pytest
 
 import reskin
 from pipeline.experiments import interference as experiment
-from pipeline.experiments.interference import JOINTS, SHIPPED, Interference, Pad, Presses, Sensor
+from pipeline.experiments.interference import JOINTS, REFERENCE_CHIP, SHIPPED, Interference, Pad, Presses, Sensor
 from pipeline.report.tables import interference_contacts, interference_places
 from pipeline.settings import Settings, read_settings
 from pipeline.stages.ingest import ingest
@@ -29,6 +29,7 @@ RECORDED = ROOT.parent / "shared/data/leaphand"
 NOISE_uT = 4.0
 LAYOUT = paper_layout()
 MODELS = {size_uT: load_universal(external_uT=size_uT) for size_uT in (0.0, 100.0)}
+CI = read_settings("ci", ROOT)
 
 
 def noise(n: int, name: str) -> np.ndarray:
@@ -108,6 +109,16 @@ def results(settings: Settings, section: Interference, folder: Path) -> dict:
     assert experiment.figures(numbers, {}, "recorded")["interference.svg"].startswith("<svg")
     return {(row["field"], row["method"], row["external_uT"], row.get("labels_n")): row
             for row in numbers["contacts"] + numbers["places"]}  # fmt: skip
+
+
+def test_simulated_scene_shows_that_both_compensations_remove_a_uniform_field(tmp_path):
+    section = CI.section(Interference, "interference")
+    found = results(CI, section, tmp_path)
+    false_pct = {key[:3]: row["false_pct"]["mean"] for key, row in found.items() if key[3] is None}
+    assert false_pct["uniform_50_uT", SHIPPED, 0.0] > 90
+    assert false_pct["uniform_50_uT", REFERENCE_CHIP, 0.0] == false_pct["uniform_50_uT", SHIPPED, 30.0] == 0
+    fields = {"none", "uniform_50_uT", "iron_5_mm"}
+    assert {key[::3] for key in found} == {(field, n) for field in fields for n in (None, *section.labels_n)}
 
 
 @pytest.mark.skipif(not RECORDED.is_dir(), reason="the recordings of the hand are not here")

@@ -138,6 +138,15 @@ def square_recording(axes: BoardAxes) -> Readings:
     )  # fmt: skip
 
 
+def test_departures_from_a_layout_name_the_layout_instead_of_the_scene():
+    axes = square_axes()
+    recording = square_recording(axes)
+    assert find_departure([recording], axes) is None
+    swapped = recording.b_uT.reshape(25, 4, 3)[:, [0, 3, 2, 1]].reshape(25, 12)
+    sentence = find_departure([replace(recording, b_uT=swapped)], axes)
+    assert sentence == "Contrary to layout square, chips 1 and 3 are exchanged."
+
+
 def test_presses_outside_the_skin_are_reported_before_orientations_are_compared():
     axes = square_axes()
     recording = square_recording(axes)
