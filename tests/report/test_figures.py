@@ -21,6 +21,19 @@ from tests.report.synthetic import all_experiments, new_board, texts_of
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)
 
 
+def draw_grid(error_mm: float = 0.5) -> str:
+    return error_grid(PLACES_MM, PLACES_MM + error_mm, title="lab (recorded), lobo")
+
+
+def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
+    elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
+    # The figure on the paper's grid has more elements: five chips, the skin and two entries of the legend. Its axes
+    # have two spines fewer.
+    assert draw_grid().count("-patch_") - elsewhere.count("-patch_") == 5 + 1 + 2 - 2
+    assert "chip" in draw_grid()
+    assert "chip" not in elsewhere
+
+
 def test_title_of_the_figure_states_the_place_with_the_largest_error():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
