@@ -150,7 +150,7 @@ def add(
     ] = None,
     columns: Annotated[
         Path | None,
-        Option(help="Layout table: YAML file that maps the columns and units of the file (docs/add-a-skin.md)."),
+        Option(help="Layout table: YAML file that maps the columns and units of the file (docs/add-your-data.md)."),
     ] = None,
     allow_copy: Annotated[
         bool,

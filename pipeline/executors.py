@@ -27,7 +27,7 @@ from reskin.numerics import DEVICE_VARIABLE, device, signature
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT, HERE = "processes:2", "here"
 CLUSTER = "dask:"  # prefix of the address of a running scheduler
-HELP = "docs/cluster.md describes how to start workers."
+HELP = "docs/teams.md describes how to start workers."
 CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 CODE = (".py", ".json", ".safetensors")  # settings may differ, because they are sent with each call

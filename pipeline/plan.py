@@ -19,7 +19,7 @@ HEADER = """\
 # The scenes that `dvc repro` runs, and the items (scenes, captures or folders) for which each stage of dvc.yaml runs.
 # Do not edit: `reskin scenes use` writes this file from pipeline/scenes and data/captures.yaml.
 """
-MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
+MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/teams.md)
 NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the robot; their experiments read the raw captures
 
 

@@ -218,7 +218,7 @@ def scene_names(root: Path) -> list[str]:
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 
-def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/add-a-scene.md.") -> Path:
+def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/extend.md.") -> Path:
     """Return the file of a scene; raise `ParamsError` if there is none."""
     known = scene_names(root)
     if name not in known:

@@ -491,7 +491,7 @@ def export(
         float | None, Option("--rate-hz", help="Readings per second of recordings that contain no times.", min=1.0)
     ] = None,
 ) -> None:
-    """Export recordings as a dataset with which robot policies can be trained (docs/robots.md)."""
+    """Export recordings as a dataset with which robot policies can be trained (docs/python.md)."""
     from reskin.robots.dataset import export_lerobot
 
     counts = export_lerobot(files, out, task=task, fps=fps, rate_hz=rate_hz)

@@ -1,4 +1,4 @@
-"""Tests of training on a Dask cluster: a scheduler and two workers on this machine, started as docs/cluster.md says."""
+"""Tests of training on a Dask cluster: a scheduler and two workers on this machine, started as docs/teams.md says."""
 
 import os
 import signal

@@ -3,9 +3,9 @@
 The slide and the magnetisation of the nominal skin are from these fits. Run in a checkout with the recordings of scene
 lab (`reskin fetch lab`, `reskin scenes use lab`, `dvc repro describe@lab`):
 
-    python -m tools.fit_skin lab > docs/measured/skin.md
+    python -m tools.fit_skin lab
 
-Each board is fitted three times, always with the gap of its layout:
+docs/synthetic-skin.md has the output. Each board is fitted three times, always with the gap of its layout:
 
 - linear: without stiffening, presses up to 4.5 N. The released network scales forces by 3 N, so the paper's skins were
   pressed about as hard.
@@ -43,7 +43,7 @@ LINEAR = (
 )  # fmt: skip
 ABOUT = """\
 - fits: `linear` without stiffening, `stiffening` with a fitted exponent, both up to 4.5 N; `hard`: the same, all forces
-- sd_...: standard deviation over fits to places that are drawn with replacement
+- ±: standard deviation over fits to places that are drawn with replacement
 - cosine: mean cosine between recorded and simulated field changes; growth: exponent n in |dB| ~ F^n
 - beyond_n: number of presses whose force is too large for the law
 """
@@ -99,6 +99,15 @@ def fit_board(presses: AlignedPresses, setup: Setup, draws_n: int) -> Iterator[d
         }  # fmt: skip
 
 
+def show(fits: pd.DataFrame) -> str:
+    """Return a table with a column per fit and board."""
+    shown = fits.drop(columns=[f"sd_{key}" for key in SHOWN]).map(lambda x: f"{x:.3g}" if isinstance(x, float) else x)
+    for key in SHOWN:
+        shown[key] += fits[f"sd_{key}"].map(" ± {:.2g}".format)
+    shown.index = pd.Index(fits["fit"] + ", " + fits["board"])
+    return shown.drop(columns=["fit", "board"]).T.to_markdown()
+
+
 def over_boards(fits: pd.DataFrame) -> pd.DataFrame:
     """Return the mean over boards of the linear fits, and the standard deviation between boards."""
     linear = fits[fits["fit"] == "linear"].set_index("board")[list(SHOWN)]
@@ -124,7 +133,7 @@ def main() -> None:
     fits = pd.DataFrame(rows)
     print(f"Fits to the recorded boards of scene {arguments.scene} (`python -m tools.fit_skin {arguments.scene}`)\n")
     print(ABOUT)
-    print(fits.to_markdown(index=False, floatfmt=".3g"))
+    print(show(fits))
     print("\nOver boards, linear fits\n")
     print(over_boards(fits).to_markdown(floatfmt=".3g"))
 

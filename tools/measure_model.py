@@ -1,10 +1,11 @@
-"""Measure the shipped model on simulated skins: accuracy, intervals and alarms -> docs/measured/model.md.
+"""Measure the shipped model on simulated skins: accuracy, intervals and alarms.
 
     python -m tools.measure_model
 
 It also tells what recorded boards add (`reskin model make --recordings`), on simulated rigs of three boards: models
 that know two of them are tested on the third. The skins are drawn from the population of the training, with other
-random numbers; their law errs as much as that of recorded boards. This takes a quarter of an hour of one core.
+random numbers; their law errs as much as that of recorded boards. This takes a quarter of an hour of one core. The
+tables are written between the markers `measured` of docs/learning.md.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,8 @@ from reskin.universal.making import REFERENCE_ERROR, WITH_BOARDS, hold_out, simu
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_law, draw_skin
 
-OUT = Path("docs/measured/model.md")
+PAGE = Path("docs/learning.md")
+MARKERS = ("<!-- measured -->\n", "<!-- /measured -->")
 SKINS_N, SEED, LABELS_N, FORCE_MIN_N = 200, 7, (0, 1, 10, 40), 0.5
 LABELS_OF_ALARMS_N = 10
 REFINED_N, RIGS_N, BOARDS_N = 20, 3, 3
@@ -180,7 +182,7 @@ def measure_rigs(model: Universal) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure, and write the page."""
+    """Measure, and write the tables into the page."""
     model, skins = load_universal(), draw(paper_layout(), SKINS_N)
     scores = [
         {"split": split, "labels": n, **score(model, skins, n, halves=split == "halves")}
@@ -212,7 +214,10 @@ def main() -> None:
         "boards. Boards of a rig share errors of the law, origin of labels, slide and modulus, or nothing.", "",
         pd.DataFrame(measure_rigs(model)).to_markdown(index=False), "",
     ]  # fmt: skip
-    OUT.write_text("\n".join(text), encoding="utf-8")
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(MARKERS[0])
+    PAGE.write_text(
+        before + MARKERS[0] + "\n".join(text) + MARKERS[1] + rest.partition(MARKERS[1])[2], encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

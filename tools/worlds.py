@@ -4,7 +4,7 @@ The networks of table 2 are trained and tested in several worlds. A world is a s
 simulation in one respect, such as how differently skins slide. The worlds are in tools/worlds.yaml. All worlds have the
 same presses, noise, folds and random draws of skins. Run in the checkout:
 
-    python -m tools.worlds --figure docs/img/worlds.svg
+    python -m tools.worlds --figure docs/images/worlds.svg
 """
 
 import argparse
@@ -207,7 +207,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", nargs="+", help="names of worlds; default: all worlds")
     parser.add_argument("--steps-n", type=int, help="number of training steps, for a quick trial")
-    parser.add_argument("--figure", type=Path, help="file for the figure, such as docs/img/worlds.svg")
+    parser.add_argument("--figure", type=Path, help="file for the figure, such as docs/images/worlds.svg")
     arguments = parser.parse_args()
     preload_training()
     content = read_yaml(FILE)

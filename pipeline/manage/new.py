@@ -17,7 +17,7 @@ PRESSES_MAX_N = 65  # largest number of unlabelled presses of a held-out skin, a
 LABELS_N = (0, 1, 10, 20, 40)
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\
-# Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/parameters.md explains the keys.
+# Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/settings.md explains the keys.
 source: {source}
 boards: [{boards}] # `reskin add` accepts only these names
 seed: 2021

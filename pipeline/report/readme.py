@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pipeline.report.figures import score_figures, unseen_rows
 from pipeline.report.numbers import join
 from pipeline.report.page import Page, pick
@@ -21,7 +23,7 @@ SHOWN = ("quick", "paper", "lab", "ini", "eflesh")  # scenes whose results the b
 TIMES = "reports/time.json"  # times of fresh clones, measured by tools/benchmarks/repro.py
 SHIPPED_FILE = "reskin/universal/universal.safetensors"
 MEASURED = "reskin/universal/measured.json"  # results of the shipped model that the live page shows
-FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was made with recordings
+FIGURE = "docs/images/headline.svg"  # shows the shipped model, and a model that was made with recordings
 
 
 def fill_pages(root: Path, *, write: bool) -> list[str]:
@@ -35,20 +37,26 @@ def fill_pages(root: Path, *, write: bool) -> list[str]:
 
 def texts_of(root: Path) -> dict[str, str]:
     """Return the generated files, with the results of `reports/`, by name."""
-    scenes = {}
-    for name in SHOWN:
-        file = root / "reports" / name / "numbers.json"
-        if not file.exists():
-            raise ParamsError(
-                f"{file} is missing, but README.md shows its results. Restore it: git restore reports/{name}"
-            )
-        scenes[name] = join(io.read_json(file), io.read_json(file.with_name("provenance.json")))
+    scenes = {name: read_results(root, name) for name in SHOWN}
     times = io.read_json(root / TIMES)
     texts = {name: fill_blocks(name, _read(root / name), scenes, times) for name in BLOCKS}
     lab = scenes["lab"]
     figure = score_figures(lab, lab["provenance"]["source"])["headline.svg"]
     measured = json.dumps(measured_of(lab, io.sha256(root / SHIPPED_FILE)), indent=2, allow_nan=False)
     return texts | {FIGURE: figure, MEASURED: measured + "\n"}
+
+
+def read_results(root: Path, name: str) -> dict[str, Any]:
+    """Return the numbers of a scene, their provenance, and the number of claims with each verdict (key `claims`)."""
+    folder = root / "reports" / name
+    if not (folder / "numbers.json").exists():
+        raise ParamsError(
+            f"{folder}/numbers.json is missing, but README.md shows its results. Restore it: git restore reports/{name}"
+        )
+    numbers = join(io.read_json(folder / "numbers.json"), io.read_json(folder / "provenance.json"))
+    claims = folder / "tables/claims.csv"  # scenes that test no claim have none
+    verdicts = pd.read_csv(claims)["verdict"].value_counts().to_dict() if claims.exists() else {}
+    return {**numbers, "claims": verdicts}
 
 
 def fill_blocks(name: str, text: str, scenes: Mapping[str, Any], times: Mapping[str, Any]) -> str:

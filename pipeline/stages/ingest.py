@@ -51,7 +51,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
 
     This stage is for scenes with many captures. With one DVC stage for each capture, the overhead of DVC would take
     longer than the ingestion itself. A capture is not ingested again if its bytes, the code and the settings are
-    unchanged. Its readings are then copied from a cache (docs/growth.md).
+    unchanged. Its readings are then copied from a cache (docs/teams.md).
     """
     cache = home() / CACHE / settings.scene
     policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]

@@ -1,6 +1,6 @@
 """Convert tables of other recorders to layout `table`, by a map of columns that the user writes as a YAML file.
 
-docs/add-a-skin.md has an example. Tables may be text (also compressed or in UTF-16), Parquet, JSON lines or npz.
+docs/add-your-data.md has an example. Tables may be text (also compressed or in UTF-16), Parquet, JSON lines or npz.
 """
 
 import re

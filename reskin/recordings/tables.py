@@ -497,7 +497,7 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
         raise CaptureError(
             f"{where}: no column {', '.join(missing)}. Check that the layout is {layout}, and that line 1 has the "
             "column names. See data/README.md. If the values have other names or units, describe them in a file for "
-            "option --columns (docs/add-a-skin.md)."
+            "option --columns (docs/add-your-data.md)."
         )
 
 
@@ -510,7 +510,7 @@ def _renaming(names: list[str], wanted: list[str]) -> str:
     if "Bx0" not in names and {"Bx1", "By1", "Bz1"} <= set(names):
         return (
             "The chips seem to be numbered from 1. Number them from 0, or state it in a file for option --columns: "
-            'fields: {Bx: "Bx{}", By: "By{}", Bz: "Bz{}", first: 1} (docs/add-a-skin.md).'
+            'fields: {Bx: "Bx{}", By: "By{}", Bz: "Bz{}", first: 1} (docs/add-your-data.md).'
         )
     return ""
 

@@ -2,7 +2,7 @@
 
 The package lerobot is not needed. The class of a robot creates the sensor from its configuration, and connects and
 disconnects the sensor together with the motors and cameras. The class adds the sensor's `observation_features` to the
-features of the robot, and the values that `async_read` returns to each observation (see docs/robots.md).
+features of the robot, and the values that `async_read` returns to each observation (see docs/python.md).
 """
 
 import math

@@ -93,7 +93,7 @@ class Law:
     # chosen on both boards of scene lab.
     lets_go_N: float = 8.0
     # Exponent by which the force grows as the layer becomes thinner (`slide.stiffening_factor`): mean of the fits to
-    # both boards of scene lab with forces up to 9.5 N, weighted by their uncertainties (docs/measured/skin.md).
+    # both boards of scene lab with forces up to 9.5 N, weighted by their uncertainties (docs/synthetic-skin.md).
     stiffening: float = 1.2
     # Lateral stiffness (7 N/mm) divided by the friction coefficient (0.8), both from nominal.yaml, key skin.hold. It
     # limits the slide under a light press, because friction can then cause only a part of the displacement.

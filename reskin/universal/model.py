@@ -529,7 +529,7 @@ class Universal:
         self._set(self._skin.data)  # from now on, estimates are those of a model that reads the file
 
     def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
-        """Write the calibrated model as an ONNX file, so that programs without Python can use it (docs/robots.md).
+        """Write the calibrated model as an ONNX file, so that programs without Python can use it (docs/python.md).
 
         The input `db_uT` contains changes of the field since the no-load reading, along the axes of the chips, with
         shape [f, ch] and in double precision. There is one output for each attribute of an `Estimate`, and the output

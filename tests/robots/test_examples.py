@@ -1,4 +1,4 @@
-"""Tests that the commands and examples in docs/robots.md run, with fakes of LeRobot and of the board."""
+"""Tests that the commands and examples in docs/python.md run, with fakes of LeRobot and of the board."""
 
 import json
 import re
@@ -21,7 +21,7 @@ from tests.stages.checkout import ROOT
 from tests.test_predicting import write_stream
 from tests.universal.skins import draw
 
-PAGE = (ROOT / "docs/robots.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGE, re.DOTALL))
 COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
 

@@ -19,8 +19,8 @@ from reskin import io
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
-PAGE = (ROOT / "docs/add-an-experiment.md").read_text(encoding="utf-8")
-MODULE, ENTRY, STAGE = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
+PAGE = (ROOT / "docs/extend.md").read_text(encoding="utf-8")
+MODULE, ENTRY, STAGE = re.findall(r"```(?:python|yaml) experiment\n(.*?)```", PAGE, re.DOTALL)
 CATALOGUE = "pipeline/catalogue.py"
 
 

@@ -11,11 +11,8 @@ Without a name, the short ones run, one after another, each in a process of its 
 The others take longer, and have arguments of their own (`python -m tools.benchmarks NAME --help`):
 
     repro      `make repro` in a fresh clone -> reports/time.json
-    install    installation of the wheel and the first live page
-    growth     cost of all stages with the number of skins or recordings -> docs/measured/growth.json
-    repeat     results with other processors, threads and versions -> docs/measured/repeat.json
-    own_boards the commands of docs/add-a-skin.md, on simulated recordings
-    teams      a team's workflow with PostgreSQL, MLflow and S3 on this machine -> docs/measured/teams.md
+    own_boards the commands of docs/add-your-data.md, on simulated recordings
+    teams      a team's workflow with PostgreSQL, MLflow and S3 on this machine
 """
 
 import runpy
@@ -23,7 +20,7 @@ import subprocess
 import sys
 
 SHORT = ("decode", "physics", "training", "model", "live")
-LONG = ("repro", "install", "growth", "repeat", "own_boards", "teams")
+LONG = ("repro", "own_boards", "teams")
 
 
 def main() -> None:

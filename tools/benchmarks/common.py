@@ -1,8 +1,7 @@
-"""What the benchmarks share: times of calls and programs, Markdown tables, and tables of steps."""
+"""What the benchmarks share: times of calls and programs, Markdown tables, and steps."""
 
 import os
 import platform
-import re
 import signal
 import subprocess
 import sys
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-MEASURED = ROOT / "docs/measured"  # one file per benchmark; pages are generated from these files
 
 
 def best_s(call: Callable[[], object], repeats_n: int = 3) -> float:
@@ -61,18 +59,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def write_block(page: str, name: str, parts: Sequence[str]) -> None:
-    """Replace the content between the markers of a block of a page by paragraphs and tables."""
-    file, text = ROOT / "docs" / page, "\n\n".join(parts)
-    pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    file.write_text(pattern.sub(lambda match: f"{match[1]}{text}\n{match[2]}", file.read_text(encoding="utf-8")))
-
-
 class Steps:
-    """Table of the steps of a long run, printed while it grows: description, seconds and result of each step."""
-
-    def __init__(self) -> None:
-        self.rows: list[dict[str, str]] = []
+    """The steps of a long run, printed as they end: description, seconds and result."""
 
     @contextmanager
     def step(self, what: str) -> Iterator[Callable[[str], None]]:
@@ -85,9 +73,7 @@ class Steps:
             results.append(f"FAILED: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
             raise
         finally:
-            seconds = f"{time.monotonic() - start_s:.1f}"
-            self.rows.append({"step": what, "seconds": seconds, "result": "; ".join(results)})
-            print(*self.rows[-1].values(), sep=" | ", flush=True)
+            print(what, f"{time.monotonic() - start_s:.1f}", "; ".join(results), sep=" | ", flush=True)
 
 
 def end_on_signals() -> None:

@@ -1,4 +1,4 @@
-"""Run the three commands of docs/add-a-skin.md on simulated recordings of three boards with six chips; time them."""
+"""Run the three commands of docs/add-your-data.md on simulated recordings of three boards with six chips; time them."""
 
 import json
 import resource

@@ -1,8 +1,8 @@
 """Run a team's workflow on this machine: PostgreSQL, MLflow, DVC remotes, merging the recordings of two people.
 
 The program starts servers on the loopback address and always stops them, even after a failure; all files are in one
-temporary folder. A table of the steps and their seconds is written to docs/measured/teams.md. It needs `pip install -e
-'.[team]' 'moto[server]'`.
+temporary folder. It prints the steps and their seconds. It needs `pip install -e '.[team]'
+'moto[server]'`.
 """
 
 import argparse
@@ -26,8 +26,7 @@ from ruamel.yaml import YAML
 
 import reskin
 from deploy import servers
-from pipeline.provenance import code_version
-from tools.benchmarks.common import ROOT, Steps, describe_machine, end_on_signals, table
+from tools.benchmarks.common import ROOT, Steps, end_on_signals
 
 SCENE = "team"
 SETTINGS = {
@@ -281,7 +280,6 @@ def run_steps(steps: Steps, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs/measured/teams.md")
     parser.add_argument("--keep", type=Path, help="folder for all files of the workflow; it is kept")
     given = parser.parse_args()
     end_on_signals()
@@ -290,8 +288,6 @@ def main() -> None:
         folder = given.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
         folder.chmod(0o755)  # PostgreSQL runs as another user
         run_steps(steps, folder.resolve())
-    heading = f"Two people share runs and recordings, on one machine. Code {code_version()}, {describe_machine()}."
-    given.out.write_text(f"{heading}\n\n{table(steps.rows)}\n")
 
 
 if __name__ == "__main__":
