@@ -22,8 +22,10 @@ import reskin.cli
 from pipeline.scenes import check_scene
 from pipeline.scores import KEYS
 from pipeline.settings import Settings, read_shared_files
+from reskin.board.custom import read_wire
 from reskin.data.rows import TARGETS
 from reskin.metrics import METRICS
+from reskin.recordings.column_map import read_map
 from reskin.schema import UNITS, arrow_schema
 from tests.stages.checkout import ROOT
 from tests.universal.skins import draw
@@ -201,6 +203,14 @@ def test_scene_and_recipe_of_the_docs_are_valid():
     page = ROOT / "docs/extend.md"
     scene, recipe = (YAML(typ="safe").load(blocks(page, f"yaml {name}")[0]) for name in ("scene", "recipe"))
     check_scene(Settings("tiny", "docs", scene | recipe, read_shared_files(ROOT)))
+
+
+def test_column_map_and_wire_format_of_the_docs_are_valid(tmp_path):
+    readers = {"add-your-data": ("columns", read_map), "live": ("wire", lambda file: read_wire(str(file)))}
+    for page, (name, read) in readers.items():
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(blocks(ROOT / f"docs/{page}.md", f"yaml {name}")[0], encoding="utf-8")
+        assert read(file)
 
 
 def test_columns_of_data_are_documented_with_units():
