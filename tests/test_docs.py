@@ -62,7 +62,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@every_page
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "docs/notebook.ipynb"], ids=lambda page: page.name)
 def test_links_and_anchors_exist(page):
     broken = []
     for link in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
