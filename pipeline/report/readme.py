@@ -20,7 +20,7 @@ BLOCKS = {
     "docs/results.md": {"results": "results.md"},
 }
 SHOWN = ("quick", "paper", "lab", "ini", "eflesh")  # scenes whose results the blocks show
-TIMES = "reports/time.json"  # times of fresh clones, measured by tools/benchmarks/repro.py
+TIMES = "reports/time.json"  # times of fresh clones, measured by `python -m tools.benchmarks repro`
 SHIPPED_FILE = "reskin/universal/universal.safetensors"
 MEASURED = "reskin/universal/measured.json"  # results of the shipped model that the live page shows
 FIGURE = "docs/images/headline.svg"  # shows the shipped model, and a model that was made with recordings
