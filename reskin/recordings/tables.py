@@ -433,7 +433,7 @@ def text_of(content: bytes, where: str) -> str:
         byte = f"{content[error.start]:#04x} at position {error.start}"
         raise CaptureError(
             f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file. If it "
-            "has a table in another container, docs/add-a-skin.md (option --columns) says which can be read."
+            "has a table in another container, docs/add-your-data.md (option --columns) says which can be read."
         ) from None
 
 
