@@ -302,8 +302,13 @@ def use(
 
 @scenes.command()
 def check() -> None:
-    """Check the settings of the scenes that `dvc repro` runs, and whether pipeline/plan.yaml is up to date."""
+    """Check the settings of the scenes that `dvc repro` runs, their plan, and whether all recordings are registered."""
+    from pipeline.manage.registry import REGISTRY, unregistered
+
     names = list(checked_plan().scenes)
+    if lost := unregistered(ROOT):
+        remedy = "No stage reads them. Delete their files, and add their recordings again."
+        typer.echo(f"warning: {REGISTRY} does not list {', '.join(lost)} in data/raw. {remedy}", err=True)
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(names) or 'none'}")
 
 

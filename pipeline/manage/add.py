@@ -17,6 +17,7 @@ from jaxtyping import Float, Float64
 from pipeline import PARAMS, PLAN, SCENES
 from pipeline.catalogue import EXPERIMENTS
 from pipeline.manage.registry import (
+    RAW,
     REGISTRY,
     Entry,
     Registry,
@@ -38,7 +39,6 @@ from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.preparing import CaptureNames, Prepared
 from reskin.schema import Readings
 
-RAW = "data/raw"
 INDENTATIONS = "data/indentations"
 # Places of this number or more are in another unit than mm if their span is this fraction of that of the chips.
 PLACES_MIN_N, SPAN_MIN = 9, 0.2
@@ -376,9 +376,10 @@ def _remove_files(target: Path) -> None:
     io.remove(target)
     io.remove(target.with_name(f"{target.name}.dvc"))
     if target.parent.is_dir():
-        ignored = target.parent / ".gitignore"
-        if ignored.exists():
-            lines = [line for line in ignored.read_text(encoding="utf-8").splitlines() if line != f"/{target.name}"]
+        ignored, line = target.parent / ".gitignore", f"/{target.name}"
+        lines = ignored.read_text(encoding="utf-8").splitlines() if ignored.exists() else []
+        if line in lines:
+            lines.remove(line)
             io.write_text(ignored, "\n".join(lines) + "\n") if lines else io.remove(ignored)
         if not any(target.parent.iterdir()):
             target.parent.rmdir()

@@ -6,11 +6,14 @@ For each scene, it lists the names, the layout and the fingerprints of the captu
 import json
 from pathlib import Path
 
+from pipeline import SCENES
+from pipeline.scenes import scene_names
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, did_you_mean
 
 REGISTRY = "data/captures.yaml"
+RAW = "data/raw"  # folder of the captures, by scene
 COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`."
 
 
@@ -50,6 +53,17 @@ def read_registry(root: Path) -> Registry:
                 raise CaptureError(f"{root / REGISTRY}: in scene {scene}, {what}. {remedy}")
             seen.update(entry.fingerprints)
     return registry
+
+
+def unregistered(root: Path) -> list[str]:
+    """List the captures on disk, as SCENE/CAPTURE, that are in no list of the registry, for example after a merge."""
+    registry, found = read_registry(root), []
+    for scene in scene_names(root):
+        folder = root / RAW / scene
+        if folder.is_dir() and "simulate" not in read_yaml(root / SCENES / f"{scene}.yaml"):
+            names = {path.name.removesuffix(".dvc") for path in folder.iterdir() if not path.name.startswith(".")}
+            found += [f"{scene}/{name}" for name in sorted(names - registry.captures.get(scene, {}).keys())]
+    return found
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:

@@ -14,8 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.manage.add import RAW
-from pipeline.manage.registry import REGISTRY
+from pipeline.manage.registry import RAW, REGISTRY
 from pipeline.scenes import scene_file
 from pipeline.stage import say
 from pipeline.tracking import PUBLISH

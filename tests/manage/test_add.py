@@ -168,6 +168,23 @@ def test_adding_a_broken_recording_raises_and_leaves_no_files(root, tmp_path, co
     assert_refused(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
 
 
+@pytest.mark.parametrize("ignored", ["", "/other", "/other\n"])
+def test_failing_add_leaves_the_scenes_gitignore_as_it_is(root, tmp_path, ignored):
+    (root / "data/raw/small").mkdir(parents=True)
+    (root / "data/raw/small/.gitignore").write_text(ignored)
+    (tmp_path / "broken.csv").write_bytes(b"")
+    assert_refused(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
+
+
+def test_scenes_check_names_captures_that_are_not_registered(root, lab_file, monkeypatch):
+    monkeypatch.chdir(root)
+    add_lab(root, lab_file)
+    assert CliRunner().invoke(app, ["scenes", "check"]).stderr == ""
+    (root / "data/captures.yaml").write_text("captures: {}\n")
+    (root / "data/raw/small/b7.dvc").write_text("")
+    assert "small/b7, small/board1_skin1_readings" in CliRunner().invoke(app, ["scenes", "check"]).stderr
+
+
 def test_missing_recording_is_an_error(root, tmp_path):
     missing = "none: file not found"
     for layout in ("lab", "ini", "eflesh", "leaphand"):
