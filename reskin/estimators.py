@@ -177,8 +177,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             got = f"{self.n_features_in_} channels and targets of shape {self._targets_shape}"
             rule = f"3 channels per chip and the targets {', '.join(TARGETS)}"
             raise SchemaError(file, "a saved network", f"for {rule}", got, "Save other networks with joblib.")
-        io.write_tensors(path, self.network_.tensors, {"format": FORMAT})
-        io.write_json(path.with_suffix(".json"), dict(self.network_.card))
+        io.write_model(path, self.network_.tensors, self.network_.card)
 
     def _recipe(self) -> Recipe:
         settings = {name: getattr(self, name) for name in Recipe.model_fields}

@@ -31,7 +31,7 @@ from reskin.schema import INGEST_AGAIN, Readings, arrow_schema, from_table, to_t
 PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file
 TABLE_BYTES_MAX_N = 6 * 10**9  # a Parquet file of a few kB may expand to any size
 COUNTS_KEY = b"reskin.account"  # key of the ingestion counts in the metadata of a Parquet file of readings
-DIGEST = "digest"  # key of the digest in the metadata of a safetensors file
+DIGEST, CARD = "digest", "card"  # keys of the digests of content and card in the metadata of a safetensors file
 HEADER_AT = 8  # position of the header in a safetensors file; the bytes before it contain the length of the header
 REMEDY = (
     "The file is incomplete, or it was changed after it was written. If `dvc repro` wrote the file, delete the file "
@@ -214,14 +214,11 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
         stream.write(memoryview(content)[stream.tell() :])
 
 
-def read_tensors(
-    path: Path, names: Sequence[str] = (), *, digest_needed: bool = False
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def read_tensors(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Read arrays and metadata from a file that `write_tensors` wrote.
 
     `names` contains the names of the arrays to read. If it is empty, all arrays are read, and the content of the file
-    is compared with its digest. If only some arrays are read, the digest is not checked. Files that older code wrote
-    have no digest. They are accepted, unless `digest_needed` is True.
+    is compared with its digest. If only some arrays are read, the digest is not checked.
     """
     _check_is_file(path)
     try:
@@ -235,10 +232,48 @@ def read_tensors(
             f"model. {REMEDY}"
         ) from None
     written = metadata.pop(DIGEST, None)
-    is_checked = not names and (digest_needed or written is not None)
-    if is_checked and written != _digest(tensors, metadata):
+    if not names and written != _digest(tensors, metadata):
         raise SchemaError(f"{path}: the file's content does not match its digest. {REMEDY}")
     return tensors, metadata
+
+
+def write_model(file: Path, tensors: Mapping[str, np.ndarray], card: Mapping[str, Any]) -> None:
+    """Write the arrays of a model as a safetensors file, and its card, which describes it, as JSON of the same name.
+
+    The metadata of the arrays contain a digest of the card, so that `read_model` can detect another or an edited card.
+    """
+    write_json(card_of(file), card)
+    write_tensors(file, tensors, {CARD: _card_digest(read_json(card_of(file)))})
+
+
+def read_model(file: Path, card: Any) -> dict[str, np.ndarray]:
+    """Read the arrays of a model; raise `SchemaError` if `card`, the content of its JSON file, is another one."""
+    tensors, metadata = read_tensors(file)
+    if metadata.get(CARD) != _card_digest(card):
+        remedy = "Copy both files of the model again, or train it again."
+        raise SchemaError(card_of(file), "the card", f"the one that was written with {file.name}", "another", remedy)
+    return tensors
+
+
+def card_of(file: Path) -> Path:
+    """Return the file of a model's card."""
+    return file.with_suffix(".json")
+
+
+def check_arrays(file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `SchemaError` unless these arrays of a file are finite float32 numbers of the given shapes."""
+    for name in dict.fromkeys([*shapes, *arrays]):
+        what, values = f"array {name}", arrays.get(name)
+        if values is None or values.shape != shapes.get(name):
+            got = "none" if values is None else values.shape
+            raise SchemaError(file, what, f"of shape {shapes.get(name)}", got, REMEDY)
+        if values.dtype != np.float32 or not np.isfinite(values).all():
+            got = "NaN or infinity" if values.dtype == np.float32 else values.dtype
+            raise SchemaError(file, what, "finite float32 numbers", got, REMEDY)
+
+
+def _card_digest(card: Any) -> str:
+    return hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:

@@ -37,8 +37,7 @@ def model(tmp_path):
     weights = {name: 0 * value for name, value in draw_weights(paper_layers(15), rng_for(0, "net")).items()}
     scaler = {"input_shift": np.zeros(15, np.float32), "input_scale": np.ones(15, np.float32)}
     scaler |= {"target_shift": ESTIMATE, "target_scale": np.ones(3, np.float32)}
-    io.write_tensors(tmp_path / "model.safetensors", weights | scaler, {})
-    io.write_json(tmp_path / "model.json", CARD)
+    io.write_model(tmp_path / "model.safetensors", weights | scaler, CARD)
     return tmp_path / "model.safetensors"
 
 
@@ -166,14 +165,9 @@ def test_unsuitable_inputs_raise_an_error_before_any_file_is_written(tmp_path, m
         ({"input": CARD["input"] | {"unit": "T"}}, "input.unit must be 'uT'; got 'T'"),
         ({"input": CARD["input"] | {"channels_n": "15"}}, "input.channels_n must be a valid integer; got '15'"),
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
-        (
-            {"input": CARD["input"] | {"channels_n": 12}},
-            "inputs raw are 12 inputs, but the weights are for 15",
-        ),
-        (
-            {"recipe": {"inputs": "shape", "architecture": "paper"}},
-            "inputs shape are 16 inputs, but the weights are for 15",
-        ),
+        ({"input": CARD["input"] | {"channels_n": 12}}, "the card must be the one"),
+        ({"recipe": {"inputs": "raw", "architecture": "released"}}, "the card must be the one"),
+        ({"seed": 3}, "the card must be the one"),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
     ],
@@ -183,6 +177,22 @@ def test_wrong_model_card_is_an_error(tmp_path, model, change, message):
     with pytest.raises(ReskinError, match=message) as refused:
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("card", "name", "change"),
+    [
+        ({}, "layer3.weight", lambda values: values * np.nan), ({}, "input_scale", lambda values: values + np.inf),
+        ({}, "layer6.bias", lambda values: values[:2]), ({}, "target_shift", lambda values: values.astype(float)),
+        ({"input": CARD["input"] | {"channels_n": 12}}, "input_scale", lambda values: values),
+        ({"recipe": {"inputs": "shape", "architecture": "paper"}}, "input_scale", lambda values: values),
+    ],
+)  # fmt: skip
+def test_network_with_arrays_that_are_not_finite_or_do_not_fit_its_card_is_refused(tmp_path, model, card, name, change):
+    tensors, _ = io.read_tensors(model)
+    io.write_model(model, tensors | {name: change(tensors[name])}, CARD | card)
+    with pytest.raises(ReskinError, match="array .* must be"):
+        load_model(model)
 
 
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])

@@ -53,8 +53,7 @@ def train_final(folder: Path, data: SceneData, training: Training, held_out: Seq
     more = {"git": code, "tested": NOT_TESTED, "held_out": records(scores), "forces_known": forces_known}
     with io.replacing(folder) as temporary:
         temporary.mkdir()
-        io.write_tensors(temporary / FILE, tensors, {"format": card["format"]})
-        io.write_json((temporary / FILE).with_suffix(".json"), card | more)
+        io.write_model(temporary / FILE, tensors, card | more)
 
 
 def final_numbers(models: Path, scene: str) -> dict[str, Any]:

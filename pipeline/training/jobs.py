@@ -263,8 +263,7 @@ def write_models(
         folder.mkdir()
         for job, result, card in zip(jobs, results, cards, strict=True):
             tensors = dict(result.weights) | result.scaler.arrays()
-            io.write_tensors(folder / f"{job.name}.safetensors", tensors, {"format": card["format"]})
-            io.write_json(folder / f"{job.name}.json", card | {"git": code})
+            io.write_model(folder / f"{job.name}.safetensors", tensors, card | {"git": code})
         io.write_table(folder / "predictions.parquet", _predictions(jobs, results, data.rows))
     write_timings(data.scene, stage, jobs, results)
     return cards

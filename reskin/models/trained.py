@@ -94,8 +94,8 @@ def read_network(model: Path) -> Network:
     ParamsError
         If the network or its card is missing.
     SchemaError
-        If the card is invalid or does not fit the weights, or if the network has collapsed, which means that it
-        predicts nearly the same value for all inputs.
+        If the card is invalid or not the one that was written with the weights, if the weights are not finite or of
+        another shape, or if the network has collapsed, which means that it predicts nearly the same for all inputs.
     """
     card_file = model.with_suffix(".json")
     if model.is_dir():
@@ -117,7 +117,7 @@ def read_network(model: Path) -> Network:
         raise ParamsError(f"{model}: this is a universal model. Load it with reskin.load_universal(file=...).")
     if form != FORMAT:
         raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
-    card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
+    card = parse(Card, content, str(card_file))
     if tuple(card.output) != TARGETS:
         outputs = ", ".join(card.output) or "nothing"
         raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Use another model.")
@@ -126,16 +126,24 @@ def read_network(model: Path) -> Network:
             f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model that was "
             "trained with another seed."
         )
-    inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
-    weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
-    if inputs_n != weights_n:
-        raise SchemaError(
-            f"{card_file}: according to the card, {card.input.channels_n} channels with inputs {card.recipe.inputs} "
-            f"are {inputs_n} inputs, but the weights are for {weights_n}. Use the card that was written with this "
-            "model."
-        )
     require("torch", model)
-    return Network(content, tensors)
+    return _read(model, content)
+
+
+def _read(model: Path, card: Mapping[str, Any]) -> Network:
+    """Read the arrays of a network; raise SchemaError if they are not finite or do not fit the card."""
+    from reskin.models.network import LAYERS  # imported here, because it imports torch
+
+    channels, tensors = np.zeros((1, card["input"]["channels_n"]), np.float32), io.read_model(model, card)
+    inputs, outputs = (VIEW[card["recipe"]["inputs"]](channels).shape[1],), (len(card["output"]),)
+    shapes = {"input_shift": inputs, "input_scale": inputs, "target_shift": outputs, "target_scale": outputs}
+    for i, layer in enumerate(LAYERS[card["recipe"]["architecture"]](*inputs, *outputs), 1):
+        shapes |= {f"layer{i}.weight": (layer.out_n, layer.in_n), f"layer{i}.bias": (layer.out_n,)}
+    finite = dict(tensors)
+    if card.get("forces_known") is False and "target_shift" in tensors:  # NaN, so that the network predicts no force
+        finite["target_shift"] = np.nan_to_num(tensors["target_shift"], nan=0, posinf=np.inf, neginf=-np.inf)
+    io.check_arrays(model, finite, shapes)
+    return Network(card, tensors)
 
 
 def _find_models(missing: Path) -> str:
@@ -158,7 +166,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
         if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
-            networks.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
+            networks.append(_read(file.with_suffix(SUFFIX), card))
     if not networks:
         what = f"there are no networks of recipe {recipe} that were trained without board {board}"
         raise SchemaError(f"{models}: {what}. To train them, add lobo to the experiments of the scene.")
@@ -174,8 +182,7 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
         if (card["question"], card["recipe_name"]) == (experiment, recipe):
-            network = Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0])
-            by_fold.setdefault(card["fold"], []).append(network)
+            by_fold.setdefault(card["fold"], []).append(_read(file.with_suffix(SUFFIX), card))
     return by_fold
 
 

@@ -10,16 +10,20 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
 
 from reskin import io
+from reskin.data.contact import CONTACT_SDS
 from reskin.errors import SchemaError
+from reskin.universal.layout import BoardLayout
 
 CHANNELS_N = 15  # values in one reading of the paper's board, which has five chips with three axes each
 # Largest accepted field, which is 20 times the range of a chip. The square of this value can be represented in single
 # precision.
 FIELD_MAX_uT = 1e6
 NOISE_uT = 5.0  # a field change that is smaller at every chip is noise
-RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
+RANGE_FACTOR = 1.25  # a label's force may be outside the model's range by this factor; the model cannot learn others
+QUIET_MIN_N = 20  # readings from which on their noise is known
 # Largest number of labels: the time to calibrate the forces grows with the third power of it.
 LABELS_MAX_N = 1000
 UNLABELLED_MAX_N = 65  # a calibration uses the latest presses at unknown places, at most this number
@@ -54,17 +58,52 @@ def check_readings(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N)
     return rows_uT
 
 
+def silent_chips(b_uT: Float[np.ndarray, "n ch"]) -> Bool[np.ndarray, "n k"]:
+    """Return which chips do not answer in which readings.
+
+    A chip does not answer if its three values are 0, or if they are equal in at least QUIET_MIN_N readings in which
+    those of other chips change.
+    """
+    chips_uT = b_uT.reshape(len(b_uT), b_uT.shape[1] // 3, 3)
+    silent = ~chips_uT.any(axis=2)
+    if len(b_uT) >= QUIET_MIN_N:
+        still = (chips_uT == chips_uT[0]).all(axis=(0, 2))
+        silent = silent | (still & ~still.all())
+    return silent
+
+
+def check_chips(where: str, b_uT: Float[np.ndarray, "n ch"]) -> None:
+    """Raise SchemaError if a chip does not answer; `where` is the name of the calling function."""
+    silent = np.argwhere(silent_chips(b_uT))
+    if len(silent) and b_uT.any():  # otherwise, the values are field changes, about which there is a warning
+        reading_i, chip_i = silent[0]
+        problem = f"chip {chip_i} does not answer in reading {reading_i}: its values are 0, or never change"
+        raise SchemaError(f"{where}: {problem}. Check its connection, or omit the reading.")
+
+
+def check_quiet(b_uT: Float[np.ndarray, "n ch"]) -> None:
+    """Raise SchemaError if some of many readings differ from the median reading by more than noise."""
+    away_uT = np.linalg.norm(b_uT - np.median(b_uT, axis=0), axis=1)
+    usual_uT = float(np.median(away_uT))
+    limit_uT = max(usual_uT * (1 + CONTACT_SDS / b_uT.shape[1] ** 0.5), NOISE_uT)
+    if touched_n := int((away_uT > limit_uT).sum()):
+        problem = f"{touched_n} of {len(b_uT)} readings differ from the others by up to {away_uT.max():.3g} uT"
+        rule = f"the noise explains at most {limit_uT:.3g} uT. Take all of them again while nothing touches the skin"
+        raise SchemaError(f"zero: {problem}; {rule}.")
+
+
 def check_labels(
     place_mm: Float[np.ndarray, "..."],
     force_N: Float[np.ndarray, "..."],
     rows_n: int,
     reach_mm: Float[np.ndarray, "2 2"],
+    range_N: tuple[float, float],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return the places and forces of labelled presses as arrays; raise SchemaError if they are invalid.
 
     There must be one place and one force for each of the `rows_n` readings, and at most LABELS_MAX_N labels. Places
     must be within `reach_mm`, whose first row has the smallest x and y and whose second row has the largest x and y.
-    Forces must be finite and above 0 N.
+    Forces must be finite, above 0 N, and within the model's range up to RANGE_FACTOR.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n})"
@@ -79,6 +118,10 @@ def check_labels(
     _need("labels", "places", f"on the skin, from {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
     _need("labels", "forces", "above 0 N", forces_N, ~(forces_N <= 0))
     _need("labels", "forces", "finite", forces_N, ~np.isinf(forces_N))
+    least_N, most_N = range_N
+    inside = ~((forces_N < least_N / RANGE_FACTOR) | (forces_N > RANGE_FACTOR * most_N))
+    rule = f"in N and about {least_N:.3g} to {most_N:.3g} N, which is the force range of the model"
+    _need("labels", "forces", rule, forces_N, inside)
     return places_mm, forces_N
 
 
@@ -87,17 +130,6 @@ def check_number(labels_n: int) -> None:
     if labels_n > LABELS_MAX_N:
         rule = f"At most {LABELS_MAX_N} labels can be used, including those that are kept"
         raise SchemaError(f"labels: {labels_n} labels are too many. {rule}. Select some of them.")
-
-
-def check_range(force_N: Float[np.ndarray, " m"], range_N: tuple[float, float]) -> None:
-    """Raise SchemaError if the force of a label is outside the model's range by a factor of `RANGE_FACTOR` or more."""
-    least_N, most_N = range_N
-    inside = ~((force_N <= least_N / RANGE_FACTOR) | (force_N >= RANGE_FACTOR * most_N))
-    if not inside.all():
-        got = f"{force_N[~inside][0]:.6g} N"
-        rule = f"about {least_N:.3g} to {most_N:.3g} N, which is the force range of the model"
-        remedy = "Convert forces in other units to N. Omit presses with forces outside the range."
-        raise SchemaError("labels", "forces", rule, got, remedy)
 
 
 # Users may pass field changes where readings are needed. Readings of presses are near the no-load reading, but field
@@ -143,11 +175,10 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 
 
 FORMAT = "reskin-skin-5"
-OLDER = ("reskin-skin-1", "reskin-skin-2", "reskin-skin-3", "reskin-skin-4")  # formats of the model before this one
 ARRAYS = ("rest_uT", "presses_uT", "labelled_mm", "labelled_N", "labelled_uT")
 REFINED = "refined."  # prefix of the names of the weights of a network that was refined on the skin
 FILE_BYTES_MAX_N = 2**24  # larger files are refused; with LABELS_MAX_N labels on 64 chips, a file has 5 MB
-REMEDY = "Use a skin that `Universal.save` or the page of `reskin live` has saved."
+REMEDY = "Use a skin that `Universal.save` or the page of `reskin live` saved. If another version did, calibrate again."
 
 
 @dataclass(frozen=True)
@@ -174,6 +205,22 @@ class LabelledPresses:
             np.concatenate([other.place_mm, self.place_mm]), np.concatenate([other.force_N, self.force_N]),
             np.concatenate([other.db_uT, self.db_uT]),
         )  # fmt: skip
+
+    def distinct(self, noise_uT: float) -> "LabelledPresses":
+        """Return each press once: a press repeats an earlier one if only noise distinguishes their readings and labels.
+
+        Raises SchemaError if equal readings have different labels.
+        """
+        away_uT = cdist(self.db_uT, self.db_uT)
+        same_place = (self.place_mm[:, None] == self.place_mm).all(axis=2)
+        off_N = self.force_N[:, None] - self.force_N  # NaN if one of two forces is unknown
+        wrong = np.argwhere((away_uT == 0) & ~(same_place & ~(np.abs(off_N) > 0)))
+        if len(wrong):
+            problem = "presses {} and {} have equal readings but different labels".format(*wrong[0])
+            raise SchemaError(f"label: {problem}. Pass a reading of its own for each press.")
+        unknown = np.isnan(self.force_N)
+        same_label = same_place & ((off_N == 0) | (unknown[:, None] & unknown))
+        return self[(same_label & (away_uT <= noise_uT)).argmax(axis=1) == np.arange(len(self))]
 
 
 @dataclass(frozen=True)
@@ -204,8 +251,10 @@ class SkinData:
         return cls(rest_uT, none, LabelledPresses(np.zeros((0, 2)), np.zeros(0), none))
 
     def and_seen(self, db_uT: Float[np.ndarray, "n ch"]) -> "SkinData":
-        """Add presses at unknown places; the oldest ones are dropped if there are too many."""
-        return replace(self, presses_uT=np.concatenate([self.presses_uT, db_uT])[-UNLABELLED_MAX_N:])
+        """Add presses at unknown places. Equal ones count once; the oldest ones are dropped if there are too many."""
+        presses_uT = np.concatenate([self.presses_uT, db_uT])
+        first = np.sort(np.unique(presses_uT, axis=0, return_index=True)[1])
+        return replace(self, presses_uT=presses_uT[first][-UNLABELLED_MAX_N:])
 
 
 def write_skin(data: SkinData, file: Path, board: str) -> None:
@@ -217,24 +266,22 @@ def write_skin(data: SkinData, file: Path, board: str) -> None:
 
 
 def is_skin(file: Path) -> bool:
-    """Return whether a file is a saved skin, of this or an older format.
+    """Return whether a file is a saved skin, of this or another version.
 
     A file that is too large to be one is not read. Raises SchemaError if a smaller file is damaged.
     """
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, *OLDER)
+    small = file.stat().st_size <= FILE_BYTES_MAX_N
+    return small and io.read_tensors(file)[1].get("format", "").startswith(FORMAT.rstrip("0123456789"))
 
 
-def read_skin_file(
-    file: Path, reach_mm: Float[np.ndarray, "2 2"], shapes: Mapping[str, tuple[int, ...]], board: str
-) -> SkinData:
+def read_skin_file(file: Path, layout: BoardLayout, shapes: Mapping[str, tuple[int, ...]]) -> SkinData:
     """Read the data of a skin from a file that `write_skin` wrote.
 
     Parameters
     ----------
     file : the file
-    reach_mm : edges of the skin relative to the board's centre: smallest x and y, then largest x and y
+    layout : the board of the model
     shapes : shapes of the weights of the model's network
-    board : name of the model's board
 
     Raises
     ------
@@ -243,18 +290,13 @@ def read_skin_file(
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         problem = f"{file}: the file has {bytes_n:,} bytes, but a saved skin has at most {FILE_BYTES_MAX_N:,}"
         raise SchemaError(f"{problem}. {REMEDY}")
-    tensors, metadata = io.read_tensors(file, digest_needed=True)
-    form, channels_n = metadata.get("format"), shapes["usual_rest"][0]
-    if form in OLDER:
-        raise SchemaError(
-            f"{file}: this skin was saved by an earlier version, whose model worked in another way. Calibrate the skin "
-            "again; a dozen presses suffice."
-        )
+    tensors, metadata = io.read_tensors(file)
+    form, channels_n = metadata.get("format"), layout.channels_n
     if form != FORMAT:
         raise SchemaError(file, "format", FORMAT, form, REMEDY)
-    if (own := metadata.get("board")) != board:
+    if (own := metadata.get("board")) != layout.name:
         remedy = f"Use this skin with the model that was made for board {own}."
-        raise SchemaError(file, "the board", f"{board}, the board of the model", own, remedy)
+        raise SchemaError(file, "the board", f"{layout.name}, the board of the model", own, remedy)
     refined = {name.removeprefix(REFINED): tensors.pop(name) for name in list(tensors) if name.startswith(REFINED)}
     got = {name: values.shape for name, values in sorted(tensors.items())}
     presses_n, labels_n = (got.get(name, (0,))[0] for name in ("presses_uT", "labelled_uT"))
@@ -263,21 +305,10 @@ def read_skin_file(
     if got != expected or presses_n > UNLABELLED_MAX_N:
         rule = f"{', '.join(ARRAYS)} of {channels_n} channels and at most {UNLABELLED_MAX_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
-    check_weights(file, refined, shapes if refined else {})
+    io.check_arrays(file, refined, shapes if refined else {})
     rest_uT, presses_uT, labelled_uT = (check_readings(tensors[name], channels_n) for name in fields)
     place_mm, force_N = check_labels(
-        tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
-    )
+        tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, layout.reach_mm,
+        layout.force_N,
+    )  # fmt: skip
     return SkinData(rest_uT[0], presses_uT, LabelledPresses(place_mm, force_N, labelled_uT), refined)
-
-
-def check_weights(file: Path, weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise SchemaError unless arrays are finite float32 numbers of the given shapes."""
-    got = {name: tuple(value.shape) for name, value in weights.items()}
-    if got != dict(shapes):
-        wrong = next(name for name in [*shapes, *got] if got.get(name) != shapes.get(name))
-        rule, remedy = f"of shape {shapes.get(wrong)}", "The file is damaged, or is of another version: make it again."
-        raise SchemaError(file, f"array {wrong}", rule, got.get(wrong, "none"), remedy)
-    for name, value in weights.items():
-        if value.dtype != np.float32 or not np.isfinite(value).all():
-            raise SchemaError(file, f"array {name}", "finite float32 numbers", value.dtype, "The file is damaged.")

@@ -61,6 +61,15 @@ class Likeness:
         scales = np.array([np.quantile(value, (0.5, share)) for value, share in values])
         return cls(raw.rest_mean, raw.rest_whiten, raw.means, raw.whiten, raw.log_weights, scales)
 
+    @staticmethod
+    def shapes(channels_n: int) -> dict[str, tuple[int, ...]]:
+        """Return the shape of each array, for a board with this number of channels."""
+        row, matrix, groups = (channels_n,), (channels_n, channels_n), (COMPONENTS_N,)
+        return {
+            "rest_mean": row, "rest_whiten": matrix, "means": groups + row, "whiten": groups + matrix,
+            "log_weights": groups, "scales": (3, 2),
+        }  # fmt: skip
+
     def rest_misfit(self, rest_uT: Float[np.ndarray, " ch"]) -> float:
         """Return the misfit of a no-load field."""
         white = (rest_uT / REST_uT - self.rest_mean) @ self.rest_whiten

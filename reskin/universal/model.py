@@ -7,8 +7,6 @@ readings along the axes of the chips. Its places are in the frame of the labels,
 the layout's `centre_mm`.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -26,18 +24,20 @@ from reskin.physics import external
 from reskin.recordings.units import WEAKEST_uT
 from reskin.universal import network
 from reskin.universal.calibration import (
+    QUIET_MIN_N,
     LabelledPresses,
     NOISE_uT,
     SkinData,
+    check_chips,
     check_is_reading,
     check_labels,
     check_number,
     check_presses,
-    check_range,
+    check_quiet,
     check_readings,
     check_shape,
-    check_weights,
     read_skin_file,
+    silent_chips,
     write_skin,
 )
 from reskin.universal.force import NORMAL_90, ForceHead, conformal
@@ -57,7 +57,6 @@ INTERVAL_FORCES_MIN_N = (
 )
 # Labels may be in cm or m if their estimates span more than this multiple of their span.
 OTHER_UNIT_SPAN = 5.0
-QUIET_MIN_N = 20  # readings without contact from which on their noise tells contact
 REFINE_MIN_N = 20  # labels from which on a refinement is offered
 # If the no-load field differs from that of the saved skin by more than this fraction, a warning says that this may be
 # another skin. In scene lab, recordings of one board differ by at most 5 %, and those of different boards by 65 %.
@@ -72,13 +71,15 @@ MISFIT_MAX = 1.0  # readings with a larger misfit are unlike those of simulated 
 class Estimate:
     """Places and forces of readings, with standard deviations.
 
-    An interval of plus or minus 1.645 standard deviations is meant to contain the true value in 90 % of the readings.
+    An interval of plus or minus 1.645 standard deviations is meant to contain the true value in 90 % of the readings. A
+    reading is not usable, and its values are NaN, if a value is missing or a chip does not answer.
     """
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
     sd_N: Float[np.ndarray, " n"]
+    usable: Bool[np.ndarray, " n"]
     contact: Bool[np.ndarray, " n"] | None = None  # whether anything touches the skin; None if the noise is unknown
 
     __repr__ = one_line
@@ -145,7 +146,7 @@ class Calibrated:
         place_mm, refined = found.place_mm, self.refined
         if refined is not None:
             place_mm = network.estimate(refined.compiled, refined.context, db_uT).place_mm
-        return Estimate(place_mm, judge.sd_mm * found.sd_mm, force_N, sd_N)
+        return Estimate(place_mm, judge.sd_mm * found.sd_mm, force_N, sd_N, np.isfinite(db_uT).all(axis=1))
 
     @cached_property
     def held_out(self) -> Normals:
@@ -398,14 +399,16 @@ class Universal:
         Raises
         ------
         SchemaError : there is no reading, or a reading is not finite, is out of range, or has the wrong number of
-            values
+            values; a chip does not answer; or some readings differ from the others, as if the skin was touched
         """
         readings_uT = check_readings(b_uT, self.channels_n)
         if not len(readings_uT):
             raise SchemaError("zero: the array of readings is empty. Pass readings that were taken without contact.")
+        check_chips("zero", readings_uT)
+        if enough := len(readings_uT) >= QUIET_MIN_N:
+            check_quiet(readings_uT)
         kept = keep and self.zeroed
         self._noload_uT = readings_uT.mean(axis=0)
-        enough = len(readings_uT) >= QUIET_MIN_N
         self._contact_uT = contact_threshold_uT(readings_uT - self._noload_uT, None) if enough else None
         self._saved_uT = self._saved_uT if kept else None
         rest_uT = self.layout.to_board(self._noload_uT[None])[0]
@@ -415,8 +418,8 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, changes: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
-        Use dozens of presses all over the skin, in one or several calls. If there are labels, the widths of intervals
-        and the correction of forces stay as they are until the next call of `label`.
+        Use dozens of presses all over the skin, in one or several calls. Equal readings count once. If there are
+        labels, the widths of intervals and the correction of forces stay as they are until the next call of `label`.
 
         b_uT : fields as the board sends them. They are not field changes, because this method subtracts the no-load
         reading, unless `changes` is set.
@@ -437,7 +440,7 @@ class Universal:
         """Calibrate to one or several labelled presses, which have known places and known forces.
 
         A single press of known force, such as a weight on the middle of the skin, calibrates the forces of the whole
-        skin.
+        skin. Readings that differ only by noise and have equal labels count as one press.
 
         Parameters
         ----------
@@ -449,21 +452,22 @@ class Universal:
 
         Raises
         ------
-        SchemaError : `zero` was not called; no field change exceeds the noise; a place is outside the skin; a force is
-            not above 0 N, or outside the model's range by a factor of 2 or more; or there are too many labels. The
-            model is not changed if this error is raised.
+        SchemaError : `zero` was not called; a reading is one without contact or of a chip that does not answer; equal
+            readings have different labels; a place is outside the skin; a force is outside the model's range; or there
+            are too many labels. The model is not changed if this error is raised.
         """
         readings_uT = check_readings(b_uT, self.channels_n)
         forces = np.full(len(readings_uT), np.nan) if force_N is None else np.asarray(force_N, float)
-        places_mm, forces_N = check_labels(np.asarray(place_mm, float), forces, len(readings_uT), self.reach_mm)
-        check_range(forces_N, self.layout.force_N)
+        places_mm, forces_N = check_labels(
+            np.asarray(place_mm, float), forces, len(readings_uT), self.reach_mm, self.layout.force_N
+        )
         db_uT = self._check_change("label", readings_uT, changes)
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT)
         data = self._skin.data if keep else self._skin.data.unrefined()
         if keep:
             labels = labels.joined_to(data.labels)
         check_number(len(labels))
-        self._set(replace(data, labels=labels))
+        self._set(replace(data, labels=labels.distinct(self._contact_uT or 0.0)))
         return self
 
     def refine(self) -> "Universal":
@@ -496,7 +500,7 @@ class Universal:
         return self
 
     def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and the normal force in N for readings in contact."""
+        """Predict x_mm, y_mm and the normal force in N for readings in contact; NaN for unusable readings."""
         estimate = self.estimate(b_uT)
         return np.column_stack([estimate.place_mm, estimate.force_N])
 
@@ -509,9 +513,8 @@ class Universal:
         contact, place and force mean nothing.
         """
         db_uT = self._change(b_uT, changes)
-        estimate, known = self._skin.estimate(db_uT), self._contact_uT is not None and not self.external_uT
-        contact = np.linalg.norm(db_uT, axis=1) > self._contact_uT if known else None
-        return replace(estimate, place_mm=estimate.place_mm + self._centre_mm, contact=contact)
+        estimate = self._skin.estimate(db_uT)
+        return replace(estimate, place_mm=estimate.place_mm + self._centre_mm, contact=self._contact(db_uT))
 
     def misfit(self, b_uT: Float[np.ndarray, "*f ch"], *, changes: bool = False) -> Float[np.ndarray, " f"]:
         """Return how unlike those of simulated skins readings in contact are: above `MISFIT_MAX`, they are unusual."""
@@ -549,7 +552,7 @@ class Universal:
         was written.
         """
         shapes = {name: value.shape for name, value in self.weights.items()}
-        data = read_skin_file(Path(file), self.layout.reach_mm, shapes, self.layout.name)
+        data = read_skin_file(Path(file), self.layout, shapes)
         self._noload_uT = self._saved_uT = self.layout.to_chips(data.rest_uT[None])[0]
         self._contact_uT = None
         self._set(data)
@@ -566,20 +569,38 @@ class Universal:
     def _change(self, b_uT: Float[np.ndarray, "*f ch"], changes: bool = False) -> Float[np.ndarray, "f ch"]:
         """Return the field changes along the board's axes, from readings or from changes along the chips' axes.
 
-        Raises SchemaError if `zero` has not been called yet.
+        They are NaN in readings in which a chip does not answer. Raises SchemaError if `zero` has not been called yet.
         """
-        baseline_uT = 0.0 if changes else self.noload_uT
-        return (check_shape(b_uT, self.channels_n) - baseline_uT) @ self._board_from_chips
+        rows_uT = check_shape(b_uT, self.channels_n)
+        if changes:
+            return rows_uT @ self._board_from_chips
+        noload_uT = self.noload_uT
+        db_uT = (rows_uT - noload_uT) @ self._board_from_chips
+        if noload_uT.any() and (silent := silent_chips(rows_uT).any(axis=1)).any():
+            db_uT[silent] = np.nan
+        return db_uT
+
+    def _contact(self, db_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"] | None:
+        """Return whether field changes are contacts; None if that is unknown."""
+        if self._contact_uT is None or self.external_uT:
+            return None
+        return np.linalg.norm(db_uT, axis=1) > self._contact_uT
 
     def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"], changes: bool) -> Float[np.ndarray, "f ch"]:
         """Return the field changes of presses along the board's axes.
 
-        Raises SchemaError if the values are probably in another unit, or if they are field changes instead of readings.
-        `where` is the name of the calling method, for the error message.
+        Raises SchemaError if the values are probably in another unit, if they are field changes instead of readings, or
+        if a reading is one without contact. `where` is the name of the calling method, for the error message.
         """
         db_uT = check_presses(self._change(b_uT, changes))
         if not changes:
             check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
+            check_chips(where, np.atleast_2d(b_uT))
+        contact = self._contact(db_uT)
+        if contact is not None and not contact.all():
+            first, rule = int(contact.argmin()), f"its field change is within the noise, {self._contact_uT:.3g} uT"
+            problem = f"{(~contact).sum()} of {len(contact)} readings are not of presses; the first is reading {first}"
+            raise SchemaError(f"{where}: {problem}: {rule}. Omit them, or press harder.")
         return db_uT
 
     def _set(self, data: SkinData, judged: Judge | None = None) -> None:
@@ -634,20 +655,14 @@ def _read_parts(file: Path, changed_ns: int) -> tuple[Weights, Likeness, Referen
     card = io.read_json(card_file)
     if (form := _format_of(card)) != FORMAT:
         raise SchemaError(card_file, "format", FORMAT, form, "Make the model again with `reskin model make`.")
-    tensors, metadata = io.read_tensors(file, digest_needed=True)
-    if metadata.get("card") != digest_of(card):
-        remedy = "Use the card that was written with the model, unchanged."
-        raise SchemaError(card_file, "the card", f"that of {file.name}", "another one", remedy)
+    tensors = io.read_model(file, card)
     layout = as_layout(card["layout"], f"{card_file}: layout")
+    shapes = {WEIGHTS + name: shape for name, shape in network.shapes(layout.channels_n).items()}
+    shapes |= {LIKENESS + name: shape for name, shape in Likeness.shapes(layout.channels_n).items()}
+    io.check_arrays(file, tensors, shapes)
     weights = {name.removeprefix(WEIGHTS): value for name, value in tensors.items() if name.startswith(WEIGHTS)}
-    check_weights(file, weights, network.shapes(layout.channels_n))
     of_likeness = {each.name: tensors[LIKENESS + each.name].astype(float) for each in fields(Likeness)}
     return weights, Likeness(**of_likeness), References(**card["references"]), layout, card
-
-
-def digest_of(card: Mapping[str, Any]) -> str:
-    """Return a digest that binds a card to the weights: they state it in their metadata."""
-    return hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def write(model: Universal, about: Mapping[str, Any], file: Path = FILE) -> None:
@@ -661,5 +676,4 @@ def write(model: Universal, about: Mapping[str, Any], file: Path = FILE) -> None
     tensors |= {
         LIKENESS + each.name: getattr(model.likeness, each.name).astype(np.float32) for each in fields(Likeness)
     }
-    io.write_json(file.with_suffix(".json"), card)
-    io.write_tensors(file, tensors, {"card": digest_of(io.read_json(file.with_suffix(".json")))})
+    io.write_model(file, tensors, card)

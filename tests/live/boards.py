@@ -75,13 +75,12 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
     scaler = {"input_shift": np.zeros(3 * chips_n), "input_scale": np.full(3 * chips_n, INPUT_SCALE_uT)}
     scaler |= {"target_shift": np.array([off_mm * 2, 0, 0]), "target_scale": np.ones(3)}
     tensors = weights | {key: value.astype(np.float32) for key, value in scaler.items()}
-    io.write_tensors(folder / f"{name}.safetensors", tensors, {})
     card_input = {"quantity": "change of field", "unit": "uT", "channels_n": 3 * chips_n}
     card = {
         "format": "reskin-model/3", "scene": "quick", "recipe": {"inputs": "raw", "architecture": "paper"},
         "input": card_input, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}, "collapsed": False,
     }  # fmt: skip
-    io.write_json(folder / f"{name}.json", card)
+    io.write_model(folder / f"{name}.safetensors", tensors, card)
     return folder / f"{name}.safetensors"
 
 

@@ -18,6 +18,7 @@ from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation import defaults
 from reskin.universal.calibration import CHANNELS_N, LABELS_MAX_N
+from reskin.universal.episodes import NOISE_uT
 from reskin.universal.model import FILE, Universal, folds_of, load_universal, thin
 from tests.universal.skins import draw
 
@@ -80,10 +81,11 @@ def test_known_skins_cause_no_alarm_and_wrong_ones_do(model):
     assert sum(bool(calibrated(model, skin, labels_n=10).warnings) for skin in skins) <= 1
     first, by_chip = skins[0], np.arange(CHANNELS_N).reshape(5, 3)
     exchanged = by_chip[[2, 1, 0, 3, 4]].ravel()
-    dead = np.arange(CHANNELS_N) >= 3
+    alive = np.arange(CHANNELS_N) >= 3
     swapped = [skin._replace(rest_uT=skin.rest_uT[exchanged], b_uT=skin.b_uT[:, exchanged]) for skin in skins]
     assert sum("unlike the skins" in " ".join(calibrated(model, skin).warnings) for skin in swapped) >= 9
-    silent = first._replace(rest_uT=first.rest_uT * dead, b_uT=first.b_uT * dead)
+    noise_uT = rng_for(0, "silent").standard_normal(first.b_uT.shape)
+    silent = first._replace(b_uT=np.where(alive, first.b_uT, first.rest_uT + noise_uT))
     assert any("chip 0 does not respond" in text for text in calibrated(model, silent).warnings)
     mirrored = first._replace(place_mm=[16.0, 0.0] + [-1.0, 1.0] * first.place_mm)
     assert any("labels contradict" in text for text in calibrated(model, mirrored, labels_n=10).warnings)
@@ -156,12 +158,86 @@ def test_invalid_labels_are_refused_and_change_nothing(model, place_mm, force_N,
 
 def test_many_labels_are_thinned_and_every_label_is_held_out_once(model):
     skin = draw(12)[0]
-    model.zero(skin.rest_uT).label(np.tile(skin.place_mm, (2, 1)), np.tile(skin.force_N, 2), np.tile(skin.b_uT, (2, 1)))
+    again_uT = skin.b_uT + rng_for(0, "again").standard_normal(skin.b_uT.shape)
+    b_uT = np.concatenate([skin.b_uT, again_uT])
+    model.zero(skin.rest_uT).label(np.tile(skin.place_mm, (2, 1)), np.tile(skin.force_N, 2), b_uT)
     labels = model.skin.data.labels
     assert (model.labels_n, len(thin(labels, 100))) == (260, 100)
     assert sorted(np.concatenate([tested for _, tested in folds_of(260)])) == list(range(260))
     assert not any(np.isin(kept, tested).any() for kept, tested in folds_of(260))
     assert np.isfinite(model.predict(skin.b_uT)).all()
+
+
+# --- Wrong data ---
+
+
+def quiet_readings(skin, n=100):
+    return skin.rest_uT + np.tile(NOISE_uT, 5) * rng_for(0, "no load").standard_normal((n, CHANNELS_N))
+
+
+@pytest.fixture
+def skin():
+    return draw(12)[1]
+
+
+def test_no_load_readings_with_contacts_or_a_dead_chip_are_refused(model, skin):
+    quiet_uT, first = quiet_readings(skin), np.arange(CHANNELS_N) < 3
+    for wrong_uT, rule in (
+        (np.concatenate([quiet_uT, skin.b_uT[:20]]), "20 of 120 readings differ"),
+        (quiet_uT * ~first, "chip 0 does not answer"),
+        (quiet_uT[0] * ~first, "chip 0 does not answer"),
+        (np.where(first, quiet_uT[0], quiet_uT), "chip 0 does not answer"),
+    ):
+        with pytest.raises(SchemaError, match=rule):
+            model.zero(wrong_uT)
+    assert model.zero(quiet_uT).zeroed
+
+
+def test_readings_without_contact_are_not_learnt_as_presses(model, skin):
+    model.zero(quiet_readings(skin))
+    mixed_uT = np.concatenate([skin.b_uT[:10], quiet_readings(skin, 5)])
+    for learn in (model.see, lambda b_uT: model.label(skin.place_mm[:15], skin.force_N[:15], b_uT)):
+        with pytest.raises(SchemaError, match="5 of 15 readings are not of presses; the first is reading 10"):
+            learn(mixed_uT)
+    assert model.presses_n == 0
+
+
+def test_labels_with_forces_of_twice_the_range_are_refused(model, skin):
+    with pytest.raises(SchemaError, match="force range of the model"):
+        model.zero(skin.rest_uT).label(skin.place_mm[0], 18.0, skin.b_uT[0])
+
+
+def test_repeated_press_counts_once(model, skin):
+    place_mm, force_N, b_uT = np.tile(skin.place_mm[0], (40, 1)), np.full(40, skin.force_N[0]), skin.b_uT[:1]
+    model.zero(quiet_readings(skin)).label(place_mm[:1], force_N[:1], b_uT)
+    once = model.estimate(skin.b_uT[TESTED])
+    for repeated_uT in (np.tile(b_uT, (40, 1)), quiet_readings(skin, 40) - skin.rest_uT + b_uT):
+        repeated_uT[0] = b_uT
+        again = model.label(place_mm, force_N, repeated_uT).estimate(skin.b_uT[TESTED])
+        assert model.labels_n == 1
+        np.testing.assert_array_equal(again.sd_N, once.sd_N)
+    assert model.zero(skin.rest_uT).see(np.tile(b_uT, (40, 1))).presses_n == 1
+
+
+def test_equal_readings_at_different_places_are_refused(model, skin):
+    model.zero(skin.rest_uT)
+    with pytest.raises(SchemaError, match="equal readings but different labels"):
+        model.label(skin.place_mm[:12], skin.force_N[:12], np.tile(skin.b_uT[0], (12, 1)))
+
+
+@pytest.mark.parametrize("chip_i", range(5))
+def test_reading_in_which_a_chip_does_not_answer_is_not_usable(model, skin, chip_i):
+    calibrated(model, skin, labels_n=10)
+    chip = np.arange(CHANNELS_N) // 3 == chip_i
+    for wrong_uT in (skin.b_uT[0] * ~chip, np.where(chip, np.nan, skin.b_uT[0])):
+        found = model.estimate(np.stack([skin.b_uT[1], wrong_uT]))
+        assert found.usable.tolist() == [True, False]
+        assert np.isnan(model.predict(wrong_uT)).all()
+    stuck_uT = np.where(chip, skin.rest_uT, skin.b_uT)
+    assert not model.estimate(stuck_uT).usable.any()
+    assert model.estimate(skin.b_uT).usable.all()
+    with pytest.raises(SchemaError, match=f"chip {chip_i} does not answer"):
+        model.see(stuck_uT)
 
 
 # --- Files ---
@@ -203,6 +279,7 @@ def test_invalid_skin_files_are_refused(model, tmp_path):
         ({"presses_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
         ({"rest_uT": one_uT[0, :12]}, "arrays must be"),
         (label | {"labelled_mm": np.full((1, 2), 40.0)}, "places must be on"),
+        (label | {"labelled_N": np.full(1, 1e30)}, "force range of the model"),
         ({"labelled_mm": np.full((1, 2), 8.0)}, "arrays must be"),
         ({"refined.empty": np.zeros(96, np.float32)}, "array .* must be of shape"),
     ]:
@@ -211,7 +288,7 @@ def test_invalid_skin_files_are_refused(model, tmp_path):
             load_universal(file)
     for header_of, rule in (
         ({"format": "reskin-skin-0"}, "format must be reskin-skin-5; got reskin-skin-0"),
-        ({"format": "reskin-skin-4"}, "saved by an earlier version.* Calibrate the skin again"),
+        ({"format": "reskin-skin-4"}, "format must be reskin-skin-5.* calibrate again"),
         (header | {"board": "mine"}, "the board must be reskin, the board of the model; got mine"),
     ):
         io.write_tensors(file, sound, {name: value for name, value in header_of.items() if name != "digest"})
@@ -234,7 +311,9 @@ def test_damaged_and_edited_models_are_refused(model, tmp_path):
     weights = model.weights
     for card, tensors, rule in (
         ({"format": "reskin-universal-4"}, {}, "format must be reskin-universal-5; got reskin-universal-4"),
-        ({"name": "mine"}, {}, "the card must be that of universal.safetensors"),
+        ({"name": "mine"}, {}, "the card must be the one that was written with universal.safetensors"),
+        (None, {"likeness.means": np.zeros((2, CHANNELS_N), np.float32)}, "array likeness.means must be of shape"),
+        (None, {"likeness.scales": np.full((3, 2), np.inf, np.float32)}, "array likeness.scales must be finite"),
         (None, {"network.empty": weights["empty"] * np.float32(np.nan)}, "finite float32 numbers"),
         (None, {"network.empty": weights["empty"].astype(float)}, "finite float32 numbers"),
         (None, {"network.empty": weights["empty"][:5]}, "must be of shape .96,."),
