@@ -250,7 +250,8 @@ def test_refinement_needs_enough_labels_and_can_be_undone(random_pokes, monkeypa
     with pytest.raises(SchemaError, match="at least 20 labels with known forces; got 0"):
         estimator.refine()
     assert not estimator.describe("")["refinable"]
-    typed = Labels(*(np.concatenate([part, part]) for part in (place_mm, force_N, db_uT)))
+    pairs = (place_mm, place_mm), (force_N, force_N), (db_uT, db_uT + 1.0)
+    typed = Labels(*(np.concatenate(pair) for pair in pairs))
     estimator._learn(estimator.learnt._replace(typed=typed, step="labels"))
     assert estimator.describe("")["refinable"]
     before = estimator(db_uT.astype(np.float32)).target
@@ -403,7 +404,12 @@ def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pok
     assert all(f"{each:.2g}" in texts["least_force"] for each in measured["detection"]["lightest_N"])
     assert f"{shipped.model.layout.force_N[0]:.2g} N" in texts["least_force"]
     # For numbers of presses or labels that were not measured, the next smaller measured number is shown.
-    many = load_universal().zero(noload_uT).see(np.tile(b_uT, (6, 1))[:65]).label(place_mm, force_N, b_uT)
+    many = (
+        load_universal()
+        .zero(noload_uT)
+        .see(np.concatenate([b_uT + i for i in range(6)])[:65])
+        .label(place_mm, force_N, b_uT)
+    )
     texts = UniversalEstimator(many).describe("s1.safetensors")
     assert texts["model"] == "universal model, file s1.safetensors"
     assert texts["learnt"] == "77 presses in the file"
