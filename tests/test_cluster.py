@@ -1,5 +1,6 @@
 """Tests of training on a Dask cluster: a scheduler and two workers on this machine, started as docs/teams.md says."""
 
+import importlib
 import os
 import signal
 import socket
@@ -53,19 +54,34 @@ def cluster() -> Iterator[SimpleNamespace]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
+    address, pem = f"tls://127.0.0.1:{port}", str(ROOT / f".reskin/dask/{port}.pem")
+    of_client = {f"distributed.comm.tls.{name}": pem for name in ("ca-file", "client.cert", "client.key")}
     with ExitStack() as processes:
+        processes.enter_context(importlib.import_module("dask").config.set(of_client))
         scheduler = processes.enter_context(dask("scheduler", str(port)))
+        while not Path(pem).exists():
+            assert scheduler.poll() is None
+            time.sleep(0.1)
         workers = [processes.enter_context(dask("worker", address)) for _ in range(2)]
         with distributed.Client(address, timeout=START_MAX_s, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=START_MAX_s)
-        yield SimpleNamespace(address=address, scheduler=scheduler, workers=workers)
+        yield SimpleNamespace(address=address, scheduler=scheduler, workers=workers, certificate=Path(pem))
+    Path(pem).unlink()
 
 
 @pytest.fixture(autouse=True)
 def environment(monkeypatch) -> None:
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_stranger_cannot_connect(cluster, protocol):
+    distributed = importlib.import_module("distributed")
+    own = distributed.Security.temporary() if protocol == "tls" else distributed.Security()
+    assert cluster.certificate.stat().st_mode & 0o077 == 0
+    with pytest.raises(OSError, match=protocol):
+        distributed.Client(cluster.address.replace("tls", protocol), timeout=3, security=own, set_as_default=False)
 
 
 @pytest.mark.parametrize(("variable", "value"), [("OMP_NUM_THREADS", "2"), ("RESKIN_DEVICE", "cuda")])
