@@ -25,6 +25,8 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 .PHONY: repro test compiled lint ui bench constraints clean
 .DEFAULT_GOAL := repro
 
+# Versions are exact, but pip compares no hashes: with --require-hashes it installs no editable project, and torch is
+# another file (and with CUDA brings other packages) on PyPI, on the index without CUDA and on the disk of some machines.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "make: Python 3.11 or newer is needed; got " + sys.version.split()[0] + ". Try: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)

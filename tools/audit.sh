@@ -1,6 +1,7 @@
 #!/bin/sh
 # List the licences of all installed packages, and the known vulnerabilities of the versions in constraints.txt.
-# Fails if a licence is not compatible with MIT, if a version has a vulnerability, or if a package cannot be audited.
+# Fails if a licence is not compatible with MIT (but for three packages under GPL or EPL, which release/licences.py names
+# and gives reasons for), if a version has a vulnerability, or if a package cannot be audited.
 set -e
 cd "$(dirname "$0")/.."
 python -m release.licences
