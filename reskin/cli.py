@@ -134,7 +134,14 @@ def add_checkout_commands() -> None:
     here = Path.cwd()
     if (here / "dvc.yaml").is_file() and (here / "pipeline/cli.py").is_file():
         sys.path.insert(0, str(here))
-        app.add_typer(importlib.import_module("pipeline.cli").app)
+        commands = importlib.import_module("pipeline.cli")
+        used, own = (Path(str(file)).resolve().parents[1] for file in (__file__, commands.__file__))
+        if used != own and sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
+            raise ParamsError(
+                f"this checkout ({own}) cannot be run with the library of {used}. Run make here, then use the command "
+                "in .venv/bin."
+            )
+        app.add_typer(commands.app)
         app.info.epilog = "Stages of dvc.yaml: python -m pipeline STAGE --scene NAME ..."
     elif sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
         raise ParamsError(

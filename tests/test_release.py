@@ -1,6 +1,7 @@
 """Tests of the release: files in the wheel, version, licences, required packages."""
 
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -127,6 +128,19 @@ def test_licences_of_all_required_packages_are_compatible():
 )  # fmt: skip
 def test_licence_is_compatible_if_one_of_its_alternatives_is(licence, compatible):
     assert is_compatible(licence) is compatible
+
+
+def test_checkout_is_not_run_with_the_library_of_another_one(tmp_path):
+    for name in ("pipeline", "reskin"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
+    program = f"import sys; sys.path[0] = {str(ROOT)!r}; from reskin.cli import main; main()"
+    for arguments, status in ((("new", "x", "--boards", "a,b", "--presses", "9"), 2), (("--version",), 0)):
+        command = [sys.executable, "-c", program, *arguments]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert ("cannot be run with the library of" in done.stderr) == (status == 2)
+        assert "Traceback" not in done.stderr
 
 
 def test_list_of_checkout_commands_is_complete():

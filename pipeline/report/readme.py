@@ -28,7 +28,11 @@ FIGURE = "docs/images/headline.svg"  # shows the shipped model, and a model that
 
 def fill_pages(root: Path, *, write: bool) -> list[str]:
     """Fill the generated blocks and files from `reports/`; return the files that change, written only if `write`."""
-    texts = texts_of(root)
+    try:
+        texts = texts_of(root)
+    except (AttributeError, KeyError, TypeError) as error:
+        what = f"numbers.json or provenance.json of a scene lacks a value, or has one of another kind ({error!r})"
+        raise SchemaError(f"{root / 'reports'}: {what}. Restore them: git restore reports") from None
     changed = [name for name, text in texts.items() if not (root / name).exists() or _read(root / name) != text]
     for name in changed if write else ():
         io.write_text(root / name, texts[name])

@@ -42,7 +42,7 @@ from pipeline.training.choice import choose, fingerprint, to_record
 from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, SchemaError
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device as trained_on
 
@@ -164,8 +164,13 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
 
 def write_index(reports: Path) -> None:
     """Write the page that lists all scenes with reports."""
-    results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
-    io.write_text(reports / "index.html", index_page([one for one in results if "described" in one]))
+    results = []
+    for file in sorted(reports.glob("*/numbers.json")):
+        numbers = io.read_json(file)
+        if not isinstance(numbers, dict):
+            raise SchemaError(f"{file}: the file has no numbers by name. Restore it: git restore {file.parent}")
+        results += [numbers] if "described" in numbers else []
+    io.write_text(reports / "index.html", index_page(results))
 
 
 def planned_scene(settings: Settings) -> Scene:
