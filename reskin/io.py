@@ -263,13 +263,13 @@ def card_of(file: Path) -> Path:
 def check_arrays(file: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise `SchemaError` unless these arrays of a file are finite float32 numbers of the given shapes."""
     for name in dict.fromkeys([*shapes, *arrays]):
-        what, values = f"array {name}", arrays.get(name)
-        if values is None or values.shape != shapes.get(name):
-            got = "none" if values is None else values.shape
-            raise SchemaError(file, what, f"of shape {shapes.get(name)}", got, REMEDY)
-        if values.dtype != np.float32 or not np.isfinite(values).all():
-            got = "NaN or infinity" if values.dtype == np.float32 else values.dtype
-            raise SchemaError(file, what, "finite float32 numbers", got, REMEDY)
+        what, values, shape = f"array {name}", arrays.get(name), shapes.get(name)
+        if values is None or values.shape != shape:
+            raise SchemaError(file, what, f"of shape {shape}", "none" if values is None else values.shape, REMEDY)
+        if values.dtype != np.float32:
+            raise SchemaError(file, what, "finite float32 numbers", values.dtype, REMEDY)
+        if not np.isfinite(values).all():
+            raise SchemaError(file, what, "finite float32 numbers", "NaN or infinity", REMEDY)
 
 
 def _card_digest(card: Any) -> str:

@@ -136,7 +136,8 @@ def _read(model: Path, card: Mapping[str, Any]) -> Network:
 
     channels, tensors = np.zeros((1, card["input"]["channels_n"]), np.float32), io.read_model(model, card)
     inputs, outputs = (VIEW[card["recipe"]["inputs"]](channels).shape[1],), (len(card["output"]),)
-    shapes = {"input_shift": inputs, "input_scale": inputs, "target_shift": outputs, "target_scale": outputs}
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("input_shift", "input_scale"), inputs)
+    shapes |= dict.fromkeys(("target_shift", "target_scale"), outputs)
     for i, layer in enumerate(LAYERS[card["recipe"]["architecture"]](*inputs, *outputs), 1):
         shapes |= {f"layer{i}.weight": (layer.out_n, layer.in_n), f"layer{i}.bias": (layer.out_n,)}
     finite = dict(tensors)

@@ -65,10 +65,10 @@ def silent_chips(b_uT: Float[np.ndarray, "n ch"]) -> Bool[np.ndarray, "n k"]:
     those of other chips change.
     """
     chips_uT = b_uT.reshape(len(b_uT), b_uT.shape[1] // 3, 3)
-    silent = ~chips_uT.any(axis=2)
+    silent: Bool[np.ndarray, "n k"] = ~chips_uT.any(axis=2)
     if len(b_uT) >= QUIET_MIN_N:
         still = (chips_uT == chips_uT[0]).all(axis=(0, 2))
-        silent = silent | (still & ~still.all())
+        silent |= still & ~still.all()
     return silent
 
 
@@ -112,7 +112,6 @@ def check_labels(
             f"labels: each press needs x and y, a force and a reading; got {got}. Pass arrays of shapes "
             "[m, 2], [m] and [m, channels]."
         )
-    check_number(rows_n)
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, from {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
@@ -123,13 +122,6 @@ def check_labels(
     rule = f"in N and about {least_N:.3g} to {most_N:.3g} N, which is the force range of the model"
     _need("labels", "forces", rule, forces_N, inside)
     return places_mm, forces_N
-
-
-def check_number(labels_n: int) -> None:
-    """Raise SchemaError if there are more than LABELS_MAX_N labels."""
-    if labels_n > LABELS_MAX_N:
-        rule = f"At most {LABELS_MAX_N} labels can be used, including those that are kept"
-        raise SchemaError(f"labels: {labels_n} labels are too many. {rule}. Select some of them.")
 
 
 # Users may pass field changes where readings are needed. Readings of presses are near the no-load reading, but field
@@ -209,8 +201,13 @@ class LabelledPresses:
     def distinct(self, noise_uT: float) -> "LabelledPresses":
         """Return each press once: a press repeats an earlier one if only noise distinguishes their readings and labels.
 
-        Raises SchemaError if equal readings have different labels.
+        Raises SchemaError if equal readings have different labels, or if there are more than LABELS_MAX_N labels.
         """
+        if not len(self):
+            return self
+        if len(self) > LABELS_MAX_N:
+            rule = f"At most {LABELS_MAX_N} labels can be used, including those that are kept"
+            raise SchemaError(f"labels: {len(self)} labels are too many. {rule}. Select some of them.")
         away_uT = cdist(self.db_uT, self.db_uT)
         same_place = (self.place_mm[:, None] == self.place_mm).all(axis=2)
         off_N = self.force_N[:, None] - self.force_N  # NaN if one of two forces is unknown
@@ -239,10 +236,6 @@ class SkinData:
     presses_uT: Float[np.ndarray, "u ch"]
     labels: LabelledPresses
     refined: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-    def unrefined(self) -> "SkinData":
-        """Return the same data without a refined network."""
-        return replace(self, refined={})
 
     @classmethod
     def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "SkinData":
@@ -287,9 +280,6 @@ def read_skin_file(file: Path, layout: BoardLayout, shapes: Mapping[str, tuple[i
     ------
     SchemaError : the file is not a saved skin, is of another board or of an older version, or a value is invalid
     """
-    if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
-        problem = f"{file}: the file has {bytes_n:,} bytes, but a saved skin has at most {FILE_BYTES_MAX_N:,}"
-        raise SchemaError(f"{problem}. {REMEDY}")
     tensors, metadata = io.read_tensors(file)
     form, channels_n = metadata.get("format"), layout.channels_n
     if form != FORMAT:
@@ -311,4 +301,4 @@ def read_skin_file(file: Path, layout: BoardLayout, shapes: Mapping[str, tuple[i
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, layout.reach_mm,
         layout.force_N,
     )  # fmt: skip
-    return SkinData(rest_uT[0], presses_uT, LabelledPresses(place_mm, force_N, labelled_uT), refined)
+    return SkinData(rest_uT[0], presses_uT, LabelledPresses(place_mm, force_N, labelled_uT).distinct(0.0), refined)

@@ -31,7 +31,6 @@ from reskin.universal.calibration import (
     check_chips,
     check_is_reading,
     check_labels,
-    check_number,
     check_presses,
     check_quiet,
     check_readings,
@@ -132,7 +131,8 @@ class Calibrated:
         """The refined network with the skin; None if there is none."""
         if not (weights := self.data.refined):
             return None
-        return replace(self, weights=weights, compiled=network.compile_weights(weights), data=self.data.unrefined())
+        data = replace(self.data, refined={})
+        return replace(self, weights=weights, compiled=network.compile_weights(weights), data=data)
 
     @cached_property
     def judge(self) -> "Judge":
@@ -349,31 +349,26 @@ class Universal:
                     f"the no-load field differs by {changed:.0%} from the no-load field of the saved skin. If this is "
                     "another skin, load that one, or calibrate the model anew."
                 )
-        off_mm, of_labels = self.labels_off_mm, data.labels.place_mm
-        if off_mm is not None and off_mm > self.references.labels_mm:
-            estimated_mm = network.estimate(self._compiled, self._skin.unlabelled_context, data.labels.db_uT).place_mm
-            span_mm, estimated_span_mm = (float(np.ptp(places, axis=0).max()) for places in (of_labels, estimated_mm))
-            if span_mm * OTHER_UNIT_SPAN < estimated_span_mm:
-                found.append(
-                    f"the labels span {span_mm:.2g} mm, but their estimates {estimated_span_mm:.2g} mm. If the places "
-                    "are in cm or m, convert them to mm."
-                )
-                return found
-            found.append(
-                f"the labels contradict the estimates: the median distance is {off_mm:.1f} mm, and at most "
-                f"{self.references.labels_mm:.1f} mm on simulated skins. Check whether the axes of the labels are "
-                "turned, mirrored or shifted, and whether each label belongs to its reading."
-            )
-        return found
-
-    @property
-    def labels_off_mm(self) -> float | None:
-        """Median distance between labelled places and their estimates without labels; None with too few labels."""
-        labels = self._skin.data.labels
-        if len(labels) < LABELS_MIN_N:
-            return None
-        found = network.estimate(self._compiled, self._skin.unlabelled_context, labels.db_uT)
-        return float(np.median(np.linalg.norm(found.place_mm - labels.place_mm, axis=1)))
+        if len(data.labels) < LABELS_MIN_N:
+            return found
+        place_mm = data.labels.place_mm
+        estimated_mm = network.estimate(self._compiled, self._skin.unlabelled_context, data.labels.db_uT).place_mm
+        off_mm = float(np.median(np.linalg.norm(estimated_mm - place_mm, axis=1)))
+        span_mm, estimated_span_mm = (float(np.ptp(places, axis=0).max()) for places in (place_mm, estimated_mm))
+        if off_mm <= self.references.labels_mm:
+            return found
+        if span_mm * OTHER_UNIT_SPAN < estimated_span_mm:
+            return [
+                *found,
+                f"the labels span {span_mm:.2g} mm, but their estimates {estimated_span_mm:.2g} mm. If the places are "
+                "in cm or m, convert them to mm.",
+            ]
+        return [
+            *found,
+            f"the labels contradict the estimates: the median distance is {off_mm:.1f} mm, and at most "
+            f"{self.references.labels_mm:.1f} mm on simulated skins. Check whether the axes of the labels are turned, "
+            "mirrored or shifted, and whether each label belongs to its reading.",
+        ]
 
     def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
         """Return a matrix that shrinks the external fields in readings to the size of noise.
@@ -463,10 +458,11 @@ class Universal:
         )
         db_uT = self._check_change("label", readings_uT, changes)
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT)
-        data = self._skin.data if keep else self._skin.data.unrefined()
+        data = self._skin.data
         if keep:
             labels = labels.joined_to(data.labels)
-        check_number(len(labels))
+        else:
+            data = replace(data, refined={})
         self._set(replace(data, labels=labels.distinct(self._contact_uT or 0.0)))
         return self
 
@@ -558,14 +554,6 @@ class Universal:
         self._set(data)
         return self
 
-    def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and force_N from field changes.
-
-        The project's trained networks can be called in the same way.
-        """
-        found = self.estimate(db_uT, changes=True)
-        return np.column_stack([found.place_mm, found.force_N]).astype(np.float32)
-
     def _change(self, b_uT: Float[np.ndarray, "*f ch"], changes: bool = False) -> Float[np.ndarray, "f ch"]:
         """Return the field changes along the board's axes, from readings or from changes along the chips' axes.
 
@@ -608,23 +596,7 @@ class Universal:
 
 
 def load_universal(skin: Path | str | None = None, *, file: Path | str = FILE, external_uT: float = 0.0) -> Universal:
-    """Load a universal model and, if a saved skin is given, calibrate it to this skin.
-
-    Parameters
-    ----------
-    skin : file that `Universal.save` wrote. If it is None, the model is not calibrated to any skin.
-    file : file of a model that `reskin model make` wrote. By default, this is the model for the paper's board, which
-        comes with the project.
-    external_uT : for a skin on a moving robot, the expected change of the external field since the no-load reading,
-        given as the standard deviation of each component. Use about 30 for the earth's field, and 100 or more if other
-        skins or magnets move nearby. Each reading is then assumed to contain an unknown external field that is uniform
-        over the board. With 0, no external field is expected. If there is indeed
-        none, estimates are more accurate with 0.
-
-    Raises
-    ------
-    SchemaError : a file is damaged, or `external_uT` is not from 0 to `EXTERNAL_MAX_uT`
-    """
+    """Load a universal model and, if a saved skin is given, calibrate it to this skin (see `reskin.load_universal`)."""
     file = Path(file)
     weights, likeness, references, layout, card = _read_parts(file, file.stat().st_mtime_ns if file.exists() else 0)
     model = Universal(weights, likeness, references, layout, card, external_uT)
@@ -632,29 +604,25 @@ def load_universal(skin: Path | str | None = None, *, file: Path | str = FILE, e
 
 
 def is_model(file: Path) -> bool:
-    """Return whether a file is a universal model, according to its model card.
-
-    The model card is the JSON file of the same name. The result is False if there is no model card.
-    """
-    card_file = file.with_suffix(".json")
-    if file.suffix != FILE.suffix or not card_file.is_file():
-        return False
-    return _format_of(io.read_json(card_file)).startswith(KIND)
+    """Return whether a file is a universal model, according to its model card, the JSON file of the same name."""
+    card_file = io.card_of(file)
+    return file.suffix == FILE.suffix and card_file.is_file() and _format_of(card_file).startswith(KIND)
 
 
-def _format_of(card: Any) -> str:
+def _format_of(card_file: Path) -> str:
+    card = io.read_json(card_file)
     return str(card.get("format")) if isinstance(card, dict) else "none"
 
 
 @lru_cache(maxsize=2)
 def _read_parts(file: Path, changed_ns: int) -> tuple[Weights, Likeness, References, BoardLayout, Mapping[str, Any]]:
-    card_file = file.with_suffix(".json")
+    card_file = io.card_of(file)
     if file.is_file() and not card_file.is_file():
         problem = f"{file}: its model card {card_file.name} is missing. Copy the card to the same folder"
         raise SchemaError(f"{problem}. If this file is a saved skin, pass it as `skin`, not as `file`.")
-    card = io.read_json(card_file)
-    if (form := _format_of(card)) != FORMAT:
+    if (form := _format_of(card_file)) != FORMAT:
         raise SchemaError(card_file, "format", FORMAT, form, "Make the model again with `reskin model make`.")
+    card = io.read_json(card_file)
     tensors = io.read_model(file, card)
     layout = as_layout(card["layout"], f"{card_file}: layout")
     shapes = {WEIGHTS + name: shape for name, shape in network.shapes(layout.channels_n).items()}
