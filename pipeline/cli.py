@@ -5,6 +5,7 @@ commands, so that `reskin --help` starts quickly.
 """
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -266,9 +267,11 @@ def readme(
     ] = False,
 ) -> None:
     """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
+    from pipeline.manage.lock import changing
     from pipeline.report.readme import fill_pages
 
-    changed = fill_pages(ROOT, write=not check)
+    with nullcontext() if check else changing(ROOT):
+        changed = fill_pages(ROOT, write=not check)
     if check and changed:
         typer.echo(f"out of date: {', '.join(changed)}; to write them again: reskin readme", err=True)
         sys.exit(1)

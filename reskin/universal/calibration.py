@@ -65,7 +65,7 @@ def silent_chips(b_uT: Float[np.ndarray, "n ch"]) -> Bool[np.ndarray, "n k"]:
     those of other chips change.
     """
     chips_uT = b_uT.reshape(len(b_uT), b_uT.shape[1] // 3, 3)
-    silent: Bool[np.ndarray, "n k"] = ~chips_uT.any(axis=2)
+    silent: Bool[np.ndarray, "n k"] = (chips_uT == 0).all(axis=2)
     if len(b_uT) >= QUIET_MIN_N:
         still = (chips_uT == chips_uT[0]).all(axis=(0, 2))
         silent |= still & ~still.all()
