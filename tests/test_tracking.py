@@ -48,7 +48,8 @@ def write_card(stage: str, name: str, **changes) -> None:
         "curve": [3.0, 2.0, 1.0], "curve_steps": [16, 32, 48], "train_rows_n": 4, "train_boards": ["b1"],
         "train_skins": ["s1"], "test_boards": ["b0"], "test_skins": ["s0"],
     }  # fmt: skip
-    io.write_json(weights.with_suffix(".json"), io.read_json(weights.with_suffix(".json")) | card | changes)
+    written = io.read_json(io.card_of(weights))
+    io.write_model(weights, io.read_tensors(weights)[0], written | card | changes)
 
 
 def write_means(accuracy_pct: float) -> None:
