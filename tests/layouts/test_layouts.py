@@ -30,6 +30,8 @@ def test_own_layout_has_its_own_gap_and_chips(mine):
     assert found["design"]["chips_xy_mm"][1] == [-6.0, 0.0]
     kind = {"letter": "b", "layout": "mine"}
     assert layouts.with_geometry(kind) == {"letter": "b"} | found
+    stated = {"letter": "b"} | usual  # without a layout, the geometry that is stated is kept
+    assert layouts.with_geometry(stated) == stated
 
 
 def test_eight_boards_lie_under_the_skin_of_the_sleeve():
