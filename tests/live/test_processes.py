@@ -163,7 +163,7 @@ def test_recording_of_a_killed_process_can_be_added(shell, tmp_path):
     (tmp_path / "probe.csv").write_text("")
     header, files = native(tmp_path / "run1.part", CaptureNames("b0", "s0", None), tmp_path / "probe.csv", ())
     assert (header.capture, header.board, header.skin) == ("run1", "b0", "s0")
-    assert files["stream.bin"].stat().st_size > 8200
+    assert 0 < len(files["stream.bin"]) <= stream.stat().st_size
 
 
 def test_recording_is_complete_if_the_board_is_unplugged(shell, tmp_path):

@@ -181,8 +181,8 @@ def test_decoded_dump_of_a_board_that_has_run_for_hours_is_loaded(tmp_path, upti
     t_s, b_uT, temperature_degC = frames_of_board()
     device_s = (t_s + uptime_s) % 4294.967296 if uptime_s < 5000 else t_s + uptime_s
     data = encode(Frames(b_uT, temperature_degC, device_s, np.zeros(FRAMES_N, np.int64)), "binary-clock")
-    table, _ = decode_dump(data, "binary-clock", CHIPS_N, "dump")
-    io.write_table(tmp_path / "decoded.parquet", table)
+    (tmp_path / "dump.bin").write_bytes(data)
+    decode_file(tmp_path / "dump.bin", tmp_path / "decoded.parquet", "binary-clock", CHIPS_N)
     frame = reskin.load_recording(tmp_path / "decoded.parquet")
     resolution_s = float(np.spacing(np.float32(uptime_s)))
     np.testing.assert_allclose(frame["t_s"] - frame["t_s"][0], t_s - t_s[0], rtol=0, atol=2 * resolution_s)
