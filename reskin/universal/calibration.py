@@ -81,12 +81,15 @@ def check_chips(where: str, b_uT: Float[np.ndarray, "n ch"]) -> None:
         raise SchemaError(f"{where}: {problem}. Check its connection, or omit the reading.")
 
 
+OUTLIERS_SHARE = 0.01  # so few wrong readings move the mean by less than the noise of a reading; assumed
+
+
 def check_quiet(b_uT: Float[np.ndarray, "n ch"]) -> None:
-    """Raise SchemaError if some of many readings differ from the median reading by more than noise."""
+    """Raise SchemaError if more than `OUTLIERS_SHARE` of many readings differ from their median by more than noise."""
     away_uT = np.linalg.norm(b_uT - np.median(b_uT, axis=0), axis=1)
     usual_uT = float(np.median(away_uT))
     limit_uT = max(usual_uT * (1 + CONTACT_SDS / b_uT.shape[1] ** 0.5), NOISE_uT)
-    if touched_n := int((away_uT > limit_uT).sum()):
+    if (touched_n := int((away_uT > limit_uT).sum())) > OUTLIERS_SHARE * len(b_uT):
         problem = f"{touched_n} of {len(b_uT)} readings differ from the others by up to {away_uT.max():.3g} uT"
         rule = f"the noise explains at most {limit_uT:.3g} uT. Take all of them again while nothing touches the skin"
         raise SchemaError(f"zero: {problem}; {rule}.")

@@ -202,3 +202,14 @@ def test_rows_of_a_table_whose_time_goes_backwards_are_counted(tmp_path):
     (tmp_path / "table.csv").write_text("\n".join(lines) + "\n")
     counts = reskin.load_recording(tmp_path / "table.csv").attrs["counts"]
     assert counts["fault_clock_jump_flagged_n"] == 1
+
+
+def test_raw_counts_of_a_chip_are_named_as_such(tmp_path):
+    lines = ["phase,x_mm,y_mm,Bx0,By0,Bz0,Fz_N"]
+    rng = rng_for(0, "raw counts")
+    for phase, force in (("noload", 0), ("contact", 1)):
+        counts = 32768 + rng.integers(-500, 500, (20, 3)) + 3000 * force
+        lines += [f"{phase},1,2,{x},{y},{z},{force}" for x, y, z in counts]
+    (tmp_path / "counts.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(CaptureError, match="raw counts"):
+        reskin.load_recording(tmp_path / "counts.csv")

@@ -113,9 +113,11 @@ def check_table(table: pa.Table, header: Header, policy: FaultPolicy, where: str
     unknown = np.full(len(contact), np.nan)
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(chips_n)], axis=1)
     checked = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
-    sound_uT = b_uT if checked.keep.all() else b_uT[checked.keep]
-    _refuse_subtracted(sound_uT, contact[checked.keep], where)
-    check_fields(sound_uT, where, line_n=FIRST_ROW + np.flatnonzero(checked.keep))
+    # If no row is fault-free, the unit may be wrong, which is checked with all rows.
+    judged = checked.keep if checked.keep.any() else np.ones(len(contact), bool)
+    judged_uT = b_uT if judged.all() else b_uT[judged]
+    _refuse_subtracted(judged_uT, contact[judged], where)
+    check_fields(judged_uT, where, line_n=FIRST_ROW + np.flatnonzero(judged))
     check_labels(numbers, contact, where, first_line_n=FIRST_ROW)
     press = _number_presses(numbers, contact, where)
     return Rows(numbers, contact, b_uT, temperature_degC, press, checked, where)
