@@ -208,7 +208,7 @@ def test_raw_counts_of_a_chip_are_named_as_such(tmp_path):
     lines = ["phase,x_mm,y_mm,Bx0,By0,Bz0,Fz_N"]
     rng = rng_for(0, "raw counts")
     for phase, force in (("noload", 0), ("contact", 1)):
-        counts = 32768 + rng.integers(-500, 500, (20, 3)) + 3000 * force
+        counts = 32768 + rng.integers(-30, 30, (200, 3)) + 300 * force
         lines += [f"{phase},1,2,{x},{y},{z},{force}" for x, y, z in counts]
     (tmp_path / "counts.csv").write_text("\n".join(lines) + "\n")
     with pytest.raises(CaptureError, match="raw counts"):
