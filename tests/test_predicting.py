@@ -282,7 +282,7 @@ def test_predictions_do_not_depend_on_the_sizes_of_blocks(tmp_path, monkeypatch,
     expected = predict(tmp_path / "log.csv", None, tmp_path / "expected.csv")
     assert expected["contacts_n"] == 4
     assert min(expected[f"dropped_{name}_rows_n"] for name in ("failed_read", "stuck_chip")) > 20
-    monkeypatch.setattr(tables, "CSV_BLOCK_BYTES_N", 100 * rows_n)
+    monkeypatch.setattr(tables, "BLOCK_BYTES_N", 100 * rows_n)
     monkeypatch.setattr(predicting, "ESTIMATED_AT_ONCE_N", rows_n)
     assert predict(tmp_path / "log.csv", None, tmp_path / "out.csv") == expected
     assert (tmp_path / "out.csv").read_text() == (tmp_path / "expected.csv").read_text()

@@ -76,7 +76,6 @@ class ColumnMap(Strict):
     phase: str | Phase  # a text: the name of a column with the values `noload` and `contact`
     columns: dict[str, str | Column]
     source: Source = "recorded"  # simulated: the file comes from an emulated board
-    delimiter: str | None = None
     decimal_comma: bool = False
 
 
@@ -103,7 +102,7 @@ def convert(recording: Path, columns: ColumnMap, where: str = "") -> pa.Table:
     Raises CaptureError if the file cannot be read, lacks a column, or has a cell that is no number in one of them.
     """
     where = where or str(recording)
-    file = TableFile(recording, where, delimiter=columns.delimiter)
+    file = TableFile(recording, where)
     fields, phase = columns.fields, columns.phase
     sources = {name: _factors(name, column, where) for name, column in columns.columns.items()}
     parts = [part for source in sources.values() for part in source]

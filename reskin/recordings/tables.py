@@ -1,7 +1,6 @@
-"""Read tables, with errors that name the line and column.
+"""Read and write tables; errors name the line and column.
 
-`parse_csv` reads files that this project wrote, with known columns and types; `TableFile` reads files that other
-recorders wrote.
+`TableFile` reads tables of any program; `parse_csv` reads CSV files whose columns and types are known.
 """
 
 import csv
@@ -14,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -31,85 +30,28 @@ COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or corr
 NUMBER_PATTERN = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 GZIP_MARK = b"\x1f\x8b"
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
-CSV_BLOCK_BYTES_N = 2**22  # bytes of a log that are parsed at once
+BLOCK_BYTES_N = 2**22  # bytes of a text file that are parsed at once
 FIRST_ROW = 2  # the first row with values; row 1 of the file has the column names
-# Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
-CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
+# Arrow's message about a row with too few or too many cells
 COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
-    """Read a table from CSV text (`source` is a str) or from a CSV file (`source` is a path).
-
-    The table must have exactly the columns of `types`, in any order. Errors name the row; row 1 is the line with the
-    column names.
-    """
-    try:
-        table = pacsv.read_csv(
-            pa.py_buffer(source.encode()) if isinstance(source, str) else source,
-            # Use one thread, because with several threads, Arrow's messages do not name the row.
-            read_options=pacsv.ReadOptions(use_threads=False),
-            parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
-            convert_options=pacsv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True),
-        )
-    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        got = ascii(" ".join(str(error).split()))[1:-1][:200]  # the error may quote a long row of binary data
-        if match := CONVERSION.search(got):
-            name, rule = _column_names(source)[int(match[1])], "a whole number" if "int" in match[3] else "a number"
-            raise CaptureError(
-                f"{where} row {match[2]}", name, rule, f"'{match[4][:20]}'", "Correct or remove this row."
-            ) from None
-        if match := COLUMNS_N.search(got):
-            what = f"the row has {match[3]} columns, but row 1 has {match[2]}"
-            raise CaptureError(f"{where} row {match[1]}: {what}. {COPY_AGAIN}") from None
-        raise CaptureError(
-            f"{where}: not a CSV file with columns {_list(types)}: {got}. Correct the row that this message names."
-        ) from None
-    except FileNotFoundError:
-        raise CaptureError(f"{where}: file not found. Copy the whole folder of the capture again.") from None
-    _check_names(table.column_names, types, where)
-    return table.select(list(types)).combine_chunks()
-
-
-def parse_torn_csv(path: Path, names: Sequence[str], where: str) -> Iterator[Float64[np.ndarray, "f c"]]:
-    """Read a CSV file of numbers in blocks; a program wrote it line by line, and some lines may be torn.
-
-    Cells that are empty or are no numbers are NaN, and so are all cells of lines with too few or too many of them.
-    Raises CaptureError if the file is not readable text.
-    """
-    text, columns_n = pa.string(), len(names)
-    with path.open("rb") as file:
-        file.readline()
-        while block := file.read(CSV_BLOCK_BYTES_N):
-            lines = (block + file.readline()).rstrip(b"\r\n").split(b"\n")
-            # A line with another number of cells becomes a line of empty cells, so that it keeps its place.
-            whole = [line if line.count(b",") == columns_n - 1 else b"," * (columns_n - 1) for line in lines]
-            try:
-                table = pacsv.read_csv(
-                    pa.py_buffer(b"\n".join(whole) + b"\n"),
-                    read_options=pacsv.ReadOptions(use_threads=False, column_names=list(names)),
-                    parse_options=pacsv.ParseOptions(quote_char=False, ignore_empty_lines=False),
-                    convert_options=pacsv.ConvertOptions(column_types=dict.fromkeys(names, text)),
-                )
-            except (pa.ArrowInvalid, UnicodeDecodeError, KeyError) as error:
-                got = ascii(" ".join(str(error).split()))[1:-1][:200]
-                raise CaptureError(
-                    f"{where}: not a CSV file with columns {_list(list(names))}: {got}. {COPY_AGAIN}"
-                ) from None
-            numbers = np.full((len(lines), columns_n), np.nan)
-            for i, name in enumerate(names):
-                cells = pc.utf8_trim_whitespace(table.column(name))
-                is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
-                numbers[:, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
-            yield numbers
-
-
-def _column_names(source: str | Path) -> list[str]:
-    """Return the names in row 1 of a CSV text or file."""
-    if isinstance(source, str):
-        return source.split("\n", 1)[0].strip().split(",")
-    with source.open(encoding="utf-8-sig", errors="replace") as file:
-        return file.readline().strip().split(",")
+    """Read the columns of `types`, in their order, from CSV text (`source` is a str) or from a CSV file."""
+    text = source if isinstance(source, str) else text_of(source, where)
+    text = text.rstrip("\n")
+    file = TableFile(f"{text}\n" if text else "", where)
+    texts = [name for name, kind in types.items() if pa.types.is_string(kind)]
+    table = file.read([name for name in types if name not in texts], texts)
+    columns: dict[str, Any] = {name: table[name] for name in texts}
+    for name, kind in types.items():
+        if name not in texts:
+            values = np.asarray(table[name])
+            if pa.types.is_integer(kind):
+                too_large = np.abs(values) > np.iinfo(kind.to_pandas_dtype()).max
+                refuse_row((values % 1 > 0) | too_large, where, name, "a whole number", values, "Correct this row.")
+            columns[name] = pa.array(values, kind, from_pandas=True)  # NaN becomes null
+    return pa.table({name: columns[name] for name in types})
 
 
 def render_csv(table: pa.Table) -> str:
@@ -134,27 +76,11 @@ def refuse_row(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str,
         raise CaptureError(f"{where} row {row_i + FIRST_ROW}", what, rule, got, remedy)
 
 
-def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str) -> None:
-    missing = [name for name in types if name not in names]
-    unknown = [name for name in names if name not in types]
-    if missing or unknown or len(names) != len(types):
-        got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in total"
-        raise CaptureError(
-            where, "the column names in row 1", _list(types), got, "Correct the names, or remove unknown columns."
-        )
-
-
-def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
-    return ",".join(names) or "none"
-
-
-# Largest magnitude of a number in a file. All readings, places and unix times are below this limit, and float32 can
-# represent numbers up to it.
-MAGNITUDE_MAX = 1e10
+# Largest magnitude of a number in a file. All readings, places, numbers of bytes and unix times in s are below it.
+MAGNITUDE_MAX = 1e12
 # Most bytes that a table may need in memory: more than 5 million readings of five chips, or 3.5 hours at 400 Hz. A
 # compressed file of a few kB could otherwise fill the memory.
 TABLE_BYTES_MAX = 2**30
-BLANKS = "blanks"  # delimiter of cells that any number of blanks and tabs separates
 OTHER_FILES = {  # first bytes of a file: what it is, and how it becomes a table
     b"PK\x03\x04": ("a zip or Excel file", "Save the sheet as CSV"),
     b"\x89HDF": ("an HDF5 file", "Write its arrays to a Parquet file: pandas.DataFrame(...).to_parquet(FILE)"),
@@ -176,20 +102,21 @@ class TableFile:
     """A table in a text file (also compressed with gzip or in UTF-16), a Parquet file, JSON lines or an npz file.
 
     `names` has the names of the columns; without `has_names`, row 1 has values, and the names are numbers from 0. The
-    delimiter of a text file is found from row 1 unless it is given. The array of an npz file with two axes gives the
-    columns name0, name1, ... Raises CaptureError if the file cannot be read.
+    delimiter of a text file is found from row 1. The array of an npz file with two axes gives the columns name0, name1,
+    ... The source is a path, or the text itself. Raises CaptureError if it cannot be read.
     """
 
-    def __init__(self, path: Path, where: str, *, delimiter: str | None = None, has_names: bool = True) -> None:
-        self._path, self._where = path, where
+    def __init__(self, source: Path | str, where: str, *, has_names: bool = True) -> None:
+        self._path, self._where = Path() if isinstance(source, str) else source, where
+        self._text: bytes | None = None  # None: the text of the file
+        self._parquet: pq.ParquetFile | None = None
+        self._table: pa.Table | None = None
         self.first_row = FIRST_ROW if has_names else 1
-        try:
-            with path.open("rb") as file:
-                start = file.read(16)
-        except OSError as error:
-            raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
         with self._explaining():
-            self._open(start, delimiter, has_names)
+            if isinstance(source, Path):
+                self._open(source, has_names)
+            else:
+                self._open_text(source, has_names)
 
     def read(self, numbers: Iterable[str], others: Iterable[str] = (), *, decimal_comma: bool = False) -> pa.Table:
         """Read columns as numbers (float64; NaN for an empty cell), and other columns as they are.
@@ -199,12 +126,7 @@ class TableFile:
         """
         others = list(others)
         names = list(dict.fromkeys([*numbers, *others]))
-        for name in names:
-            if self.names.count(name) > 1:
-                raise CaptureError(f"{self._where}: two columns have the name {name}. Remove one of these columns.")
-            if name not in self.names:
-                have, guess = ", ".join(self.names)[:200], did_you_mean(name, self.names)
-                raise CaptureError(f"{self._where}: no column {name!r}; the file has {have}.{guess} Correct the name.")
+        self._check_names(names)
         _check_size(8 * self._rows_n * len(names), self._where)
         parts: dict[str, list[pa.Array]] = {name: [] for name in others}
         made: dict[str, Any] = {name: np.empty(self._rows_n) for name in names if name not in others}
@@ -226,6 +148,47 @@ class TableFile:
         none = [pa.array([], pa.string())]
         return pa.table(made | {name: pa.chunked_array(part or none) for name, part in parts.items()})
 
+    def read_torn(self, names: Sequence[str]) -> Iterator[Float64[np.ndarray, "f c"]]:
+        """Read columns of numbers in blocks; a program wrote the file line by line, and some lines may be torn.
+
+        Cells that are empty or are no numbers are NaN, and so are all cells of lines with too few or too many of them.
+        """
+        self._check_names(names)
+        if self._parquet is not None or self._table is not None:
+            yield np.stack([np.asarray(column) for column in self.read(names).columns], axis=1)
+            return
+        delimiter, between_n = self._delimiter.encode(), len(self.names) - 1
+        with self._explaining(), self._stream() as file:
+            file.readline()
+            while block := file.read(BLOCK_BYTES_N):
+                lines = (block + file.readline()).rstrip(b"\r\n").split(b"\n")
+                # A line with another number of cells becomes a line of empty cells, so that it keeps its place.
+                whole = [line if line.count(delimiter) == between_n else delimiter * between_n for line in lines]
+                table = pacsv.read_csv(
+                    pa.py_buffer(b"\n".join(whole) + b"\n"),
+                    read_options=pacsv.ReadOptions(use_threads=False, column_names=self.names),
+                    parse_options=pacsv.ParseOptions(
+                        delimiter=self._delimiter, quote_char=False, ignore_empty_lines=False
+                    ),
+                    convert_options=pacsv.ConvertOptions(
+                        column_types=dict.fromkeys(names, pa.string()), include_columns=names
+                    ),
+                )
+                numbers = np.full((len(lines), len(names)), np.nan)
+                for i, name in enumerate(names):
+                    cells = pc.utf8_trim_whitespace(table.column(name))
+                    is_sound = pc.match_substring_regex(cells, NUMBER_PATTERN)
+                    numbers[:, i] = np.asarray(pc.cast(pc.if_else(is_sound, cells, None), pa.float64()))
+                yield numbers
+
+    def _check_names(self, names: Sequence[str]) -> None:
+        for name in names:
+            if self.names.count(name) > 1:
+                raise CaptureError(f"{self._where}: two columns have the name {name}. Remove one of these columns.")
+            if name not in self.names:
+                have, guess = ", ".join(self.names)[:200], did_you_mean(name, self.names)
+                raise CaptureError(f"{self._where}: no column {name!r}; the file has {have}.{guess} Correct the name.")
+
     @contextmanager
     def _explaining(self) -> Iterator[None]:
         try:
@@ -235,37 +198,38 @@ class TableFile:
         except UNREADABLE as error:
             problem = ascii(" ".join(str(error).split()))[1:-1][:120]
             if match := COLUMNS_N.search(problem):
-                what = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}"
-                raise CaptureError(f"{self._where}: {what}. {COPY_AGAIN}") from None
-            raise CaptureError(
-                f"{self._where}: the file cannot be read as a table: {problem}. Check the file."
-            ) from None
+                problem, remedy = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}", COPY_AGAIN
+            else:
+                problem, remedy = f"the file cannot be read as a table: {problem}", "Check the file."
+            raise CaptureError(f"{self._where}: {problem}. {remedy}") from None
 
-    def _open(self, start: bytes, delimiter: str | None, has_names: bool) -> None:
-        self._parquet: pq.ParquetFile | None = None
-        self._table: pa.Table | None = None
+    def _open(self, path: Path, has_names: bool) -> None:
+        with opened(path, self._where) as file:
+            start = file.read(16)
         if start.startswith(b"PAR1"):
-            self._parquet = pq.ParquetFile(self._path)
+            self._parquet = pq.ParquetFile(path)
             self.names, self._rows_n = list(self._parquet.schema_arrow.names), self._parquet.metadata.num_rows
-        elif start.startswith(b"PK") and all(name.endswith(".npy") for name in _members(self._path, self._where)):
-            self._table = _arrays(self._path)
+        elif start.startswith(b"PK") and all(name.endswith(".npy") for name in _members(path, self._where)):
+            self._use(_arrays(path))
         else:
             for magic, (what, remedy) in OTHER_FILES.items():
                 if start.startswith(magic):
                     raise CaptureError(f"{self._where}: the file is {what}. {remedy}.")
-            self._open_text(start, delimiter, has_names)
-        if self._table is not None:
-            self.names, self._rows_n = list(self._table.column_names), len(self._table)
+            packed = start.startswith((GZIP_MARK, *UTF16_MARKS))
+            self._open_text(text_of(path, self._where) if packed else None, has_names)
 
-    def _open_text(self, start: bytes, delimiter: str | None, has_names: bool) -> None:
-        packed = start.startswith((GZIP_MARK, *UTF16_MARKS))
-        text = text_of(_expanded(self._path, self._where), self._where) if packed else None
-        with self._path.open("rb") if text is None else bytes_io.BytesIO(text.encode()) as file:
+    def _use(self, table: pa.Table) -> None:
+        self._table, self.names, self._rows_n = table, list(table.column_names), len(table)
+
+    def _open_text(self, text: str | None, has_names: bool) -> None:
+        """Read the names of the columns, count the lines, and find the delimiter; without `text`, those of the file."""
+        self._text = None if text is None else text.encode()
+        with self._stream() as file:
             line = block = file.readline()
             self._rows_n = 1 - self.first_row
             while block:
                 last, self._rows_n = block[-12:], self._rows_n + block.count(b"\n")
-                block = file.read(2**22)
+                block = file.read(BLOCK_BYTES_N)
         if not line:
             raise CaptureError(f"{self._where}: the file is empty. Copy the recording again.")
         if not last.endswith(b"\n"):
@@ -273,19 +237,22 @@ class TableFile:
                 f"{self._where}: the last line has no line break; it ends in {last.decode(errors='replace')!a}. If the "
                 "file was cut, copy the recording again. If the last line is complete, add a line break after it."
             )
-        first = text_of(line, self._where).strip("\r\n")
+        first = _decode(line, self._where).strip("\r\n")
         if first.lstrip()[:1] == "{":
-            lines = (text or text_of(self._path.read_bytes(), self._where)).splitlines()
-            self._table = pa.Table.from_pylist([json.loads(line) for line in lines])
+            lines = (text or text_of(self._path, self._where)).splitlines()
+            self._use(pa.Table.from_pylist([json.loads(line) for line in lines]))
             return
-        self._delimiter = delimiter or (max(";\t|,", key=first.count) if re.search(r"[;\t|,]", first) else BLANKS)
-        if self._delimiter == BLANKS:
-            text = text or text_of(self._path.read_bytes(), self._where)
-            text = "\n".join("\t".join(line.split()) for line in text.split("\n"))
-            first, self._delimiter = text.partition("\n")[0], "\t"
-        self._source = self._path if text is None else pa.py_buffer(text.encode())
+        if re.search(r"[;\t|,]", first):
+            self._delimiter = max(";\t|,", key=first.count)
+        else:  # the cells are separated by any number of blanks
+            self._delimiter, text = "\t", text or text_of(self._path, self._where)
+            first, *others = ["\t".join(line.split()) for line in text.split("\n")]
+            self._text = "\n".join([first, *others]).encode()
         cells = next(csv.reader([first], delimiter=self._delimiter))
         self.names = [cell.strip() for cell in cells] if has_names else [str(i) for i in range(len(cells))]
+
+    def _stream(self) -> BinaryIO:
+        return bytes_io.BytesIO(self._text) if self._text is not None else self._path.open("rb")
 
     def _blocks(self, names: list[str]) -> Iterator[pa.RecordBatch]:
         if self._parquet is not None:
@@ -300,9 +267,9 @@ class TableFile:
         unique = [f"{i} {name}" if self.names.count(name) > 1 else name for i, name in enumerate(self.names)]
         try:
             return pacsv.open_csv(
-                self._source,
+                self._path if self._text is None else pa.py_buffer(self._text),
                 read_options=pacsv.ReadOptions(
-                    use_threads=False, skip_rows=self.first_row - 1, column_names=unique, block_size=2**22
+                    use_threads=False, skip_rows=self.first_row - 1, column_names=unique, block_size=BLOCK_BYTES_N
                 ),
                 parse_options=pacsv.ParseOptions(delimiter=self._delimiter, ignore_empty_lines=False),
                 convert_options=pacsv.ConvertOptions(
@@ -315,16 +282,16 @@ class TableFile:
             raise
 
 
-def count_columns(path: Path, where: str, delimiter: str | None) -> int:
-    return len(TableFile(path, where, delimiter=delimiter, has_names=False).names)
+def count_columns(path: Path, where: str) -> int:
+    return len(TableFile(path, where, has_names=False).names)
 
 
-def read_rows(path: Path, where: str, names: Sequence[str], delimiter: str | None) -> Float64[np.ndarray, "f c"]:
+def read_rows(path: Path, where: str, names: Sequence[str]) -> Float64[np.ndarray, "f c"]:
     """Read all columns of a text file without a row of names as finite numbers.
 
     `names` are the names of the columns in errors.
     """
-    file = TableFile(path, where, delimiter=delimiter, has_names=False)
+    file = TableFile(path, where, has_names=False)
     if len(file.names) != len(names):
         problem = f"the file has {len(file.names)} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
         raise CaptureError(f"{where}: {problem}. Check the layout and the number of chips.")
@@ -389,18 +356,17 @@ def _check_size(bytes_n: int, where: str) -> None:
         )
 
 
-def _expanded(path: Path, where: str) -> bytes:
-    """Read a file, and decompress it if it is a gzip file that is not too large."""
-    content = path.read_bytes()
-    if not content.startswith(GZIP_MARK):
-        return content
+@contextmanager
+def opened(path: Path, where: str) -> Iterator[BinaryIO]:
+    """Open a file; raise `CaptureError` if that is impossible."""
     try:
-        with gzip.open(path) as file:
-            content = file.read(TABLE_BYTES_MAX + 1)
-    except (OSError, EOFError, zlib.error):
-        raise CaptureError(f"{where}: the gzip file is damaged. Copy the file again.") from None
-    _check_size(len(content), where)
-    return content
+        file = path.open("rb")
+    except FileNotFoundError:
+        raise CaptureError(f"{where}: file not found. Check the path, or copy the whole recording again.") from None
+    except OSError as error:
+        raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Check the path.") from None
+    with file:
+        yield file
 
 
 def _members(path: Path, where: str) -> list[str]:
@@ -425,15 +391,29 @@ def _arrays(path: Path) -> pa.Table:
     return pa.table(columns)
 
 
-def text_of(content: bytes, where: str) -> str:
-    """Decode the bytes of a text file; its byte order mark, if any, tells UTF-16 from UTF-8."""
+def text_of(path: Path, where: str) -> str:
+    """Return the text of a file, which may be compressed with gzip; its byte order mark tells UTF-16 from UTF-8."""
+    with opened(path, where) as file:
+        content = file.read()
+    if content.startswith(GZIP_MARK):
+        try:
+            with gzip.open(path) as packed:
+                content = packed.read(TABLE_BYTES_MAX + 1)
+        except (OSError, EOFError, zlib.error):
+            raise CaptureError(f"{where}: the gzip file is damaged. Copy the file again.") from None
+        _check_size(len(content), where)
+    return _decode(content, where)
+
+
+def _decode(content: bytes, where: str) -> str:
     try:
         return content.decode("utf-16" if content[:2] in UTF16_MARKS else "utf-8-sig")
     except UnicodeDecodeError as error:
         byte = f"{content[error.start]:#04x} at position {error.start}"
         raise CaptureError(
             f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file. If it "
-            "has a table in another container, docs/add-your-data.md (option --columns) says which can be read."
+            "has the raw bytes of a port, decode them with `reskin decode`. If it has a table in another container, "
+            "docs/add-your-data.md (option --columns) says which can be read."
         ) from None
 
 

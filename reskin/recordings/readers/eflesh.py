@@ -62,7 +62,7 @@ def collect(recording: Path) -> dict[str, Path]:
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the columns of `sensor.csv`: the time, then three columns per chip."""
     where = str(files[SENSOR])
-    columns_n = count_columns(files[SENSOR], where, None)
+    columns_n = count_columns(files[SENSOR], where)
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
         raise CaptureError(
             f"{where}: {columns_n} columns cannot be a time and three columns per chip. Check that the layout is "
@@ -113,11 +113,9 @@ def _read_files(
 ) -> tuple[Float64[np.ndarray, "f c"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f s"]]:
     """Read the raw fields with their times, the field changes, and the states; check that they belong together."""
     fields = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
-    states_n = count_columns(folder / STATES, f"{header.capture}/{STATES}", None)
+    states_n = count_columns(folder / STATES, f"{header.capture}/{STATES}")
     names = {SENSOR: fields, CHANGES: fields, STATES: list(STATES_COLUMNS[: max(states_n, WEIGHT_COLUMN)])}
-    sensor, changes, states = (
-        read_rows(folder / name, f"{header.capture}/{name}", of, None) for name, of in names.items()
-    )
+    sensor, changes, states = (read_rows(folder / name, f"{header.capture}/{name}", of) for name, of in names.items())
     if not len(sensor) == len(changes) == len(states):
         got = f"{len(sensor)} in {SENSOR}, {len(changes)} in {CHANGES} and {len(states)} in {STATES}"
         raise CaptureError(

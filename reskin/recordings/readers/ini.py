@@ -23,7 +23,7 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.readers.alignment import find_change, find_passes
-from reskin.recordings.tables import BLANKS, count_columns, make_readings, mean_by_group, read_rows
+from reskin.recordings.tables import count_columns, make_readings, mean_by_group, read_rows
 from reskin.recordings.units import check_fields, check_labels, check_touch
 from reskin.schema import Readings
 
@@ -62,7 +62,7 @@ def collect(recording: Path) -> dict[str, Path]:
 def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the number of columns of the readings, which has four columns (X, Y, Z, T) for each chip."""
     where = str(files[READINGS])
-    columns_n = count_columns(files[READINGS], where, BLANKS)
+    columns_n = count_columns(files[READINGS], where)
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
         raise CaptureError(
             f"{where}: {columns_n} columns cannot be X, Y, Z, T for each chip. Check that the layout is ini."
@@ -122,7 +122,7 @@ def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f c
     """Read the fields (one column per channel) and the temperatures (one column per chip)."""
     names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
     where = f"{header.capture}/{READINGS}"
-    numbers = read_rows(folder / READINGS, where, names, BLANKS)
+    numbers = read_rows(folder / READINGS, where, names)
     per_chip = numbers.reshape(len(numbers), header.chips_n, VALUES_PER_CHIP_N)
     b_uT = per_chip[:, :, :3].reshape(len(numbers), -1)
     check_fields(b_uT, where, first_line_n=1)
@@ -133,7 +133,7 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
     """Read the truths: columns x in mm, y in mm and force in N."""
     where = f"{header.capture}/{TRUTHS}"
     names = ["x_mm", "y_mm", "Fz_N"]
-    truths = read_rows(folder / TRUTHS, where, names, BLANKS)
+    truths = read_rows(folder / TRUTHS, where, names)
     check_touch(truths[:, 2], where)
     check_labels(dict(zip(names, truths.T, strict=True)), truths[:, 2] >= CONTACT_MIN_N, where, first_line_n=1)
     return truths

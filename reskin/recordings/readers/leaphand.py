@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float64, Int64
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
-from reskin.recordings.tables import BLANKS, count_columns, make_readings, only_file, read_rows
+from reskin.recordings.tables import count_columns, make_readings, only_file, read_rows
 from reskin.recordings.units import check_changes
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
@@ -120,7 +120,7 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     first = CHANNELS_N * (_pad_number(header, pads_n) - 1)
     fields = [f"B{axis}{chip} of pad {pad + 1}" for pad in range(pads_n) for chip in range(CHIPS_N) for axis in "xyz"]
     joints = [f"joint {joint + 1}" for joint in range(JOINTS_N * pads_n)]
-    numbers = read_rows(folder / READINGS, where, [*fields, *joints], BLANKS)
+    numbers = read_rows(folder / READINGS, where, [*fields, *joints])
     b_uT, joint_counts = numbers[:, first : first + CHANNELS_N], numbers[:, len(fields) :]
     check_changes(b_uT, where, first_line_n=1)
     wrong = (joint_counts != np.rint(joint_counts)) | (joint_counts < 0) | (joint_counts >= COUNTS_PER_TURN)
@@ -143,7 +143,7 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
 
 def _count_pads(file: Path, where: str) -> int:
     """Return the number of pads, from the number of columns."""
-    columns_n, per_pad_n = count_columns(file, where, BLANKS), CHANNELS_N + JOINTS_N
+    columns_n, per_pad_n = count_columns(file, where), CHANNELS_N + JOINTS_N
     if columns_n % per_pad_n or not 1 <= columns_n // per_pad_n <= PADS_MAX_N:
         rule = f"{CHANNELS_N} fields and {JOINTS_N} joint positions for each of 1 to {PADS_MAX_N} pads"
         raise CaptureError(where, "the number of columns", rule, columns_n, "Check that the layout is leaphand.")
