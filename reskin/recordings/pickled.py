@@ -1,8 +1,7 @@
 """Convert an .npz archive of pickled samples, as the rig of layout `lab` writes it, to a CSV file of layout `lab`.
 
 A pickle can name any function, and loading it calls the function. Here, only the names that NumPy writes for numbers
-and arrays are known, and they stand for the classes below, which make plain numbers and lists. Any other name is
-refused.
+and arrays are known; any other name is refused.
 """
 
 import pickle
@@ -63,58 +62,16 @@ def _row(sample: Mapping[str, Any]) -> str:
     return ",".join(cells)
 
 
-class _Dtype:
-    """Stands for `numpy.dtype`: the type of a number, whose byte order is part of the state."""
-
-    def __init__(self, kind: str, *_: object) -> None:
-        self._kind, self._order = kind, "|"
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self._order = state[1]
-
-    def read(self, content: bytes) -> np.ndarray:
-        if self._kind[:1] not in "biuf":
-            raise ValueError(f"numbers of type {self._kind}")
-        return np.frombuffer(content, np.dtype(self._order + self._kind))
-
-
-class _Array(list[Any]):
-    """Stands for `numpy.ndarray`, and for the function that makes an empty one: a list, filled by the state."""
-
-    def __init__(self, *_: object) -> None:
-        super().__init__()
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, dtype, by_columns, content = state
-        if isinstance(content, list) and len(shape) == 1:
-            self.extend(content)
-        else:
-            self.extend(dtype.read(content).reshape(shape, order="F" if by_columns else "C").tolist())
-
-
-class _Scalar:
-    """Stands for the function that makes a NumPy number: makes a Python number."""
-
-    def __new__(cls, dtype: _Dtype, content: bytes) -> Any:
-        return dtype.read(content)[0].item()
-
-    def __setstate__(self, state: object) -> None:
-        raise ValueError("a number has no state")  # without this method, a pickle could set attributes of the class
-
-
 class _Unpickler(pickle._Unpickler):  # the one in Python: that in C allocates as much memory as a pickle asks for
-    KNOWN: ClassVar[Mapping[tuple[str, str], type]] = {
-        ("numpy", "dtype"): _Dtype,
-        ("numpy", "ndarray"): _Array,
-        ("numpy._core.multiarray", "_reconstruct"): _Array,
-        ("numpy._core.multiarray", "scalar"): _Scalar,
-    }
-    dispatch: ClassVar = {
-        code: load for code, load in pickle._Unpickler.dispatch.items() if code != pickle.BYTEARRAY8[0]
+    KNOWN: ClassVar = {
+        ("numpy", "dtype"),
+        ("numpy", "ndarray"),
+        ("numpy._core.multiarray", "_reconstruct"),
+        ("numpy._core.multiarray", "scalar"),
     }
 
-    def find_class(self, module: str, name: str) -> type:
-        try:
-            return self.KNOWN[module.replace("numpy.core", "numpy._core"), name]  # NumPy 2 has renamed the module
-        except KeyError:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no number or array") from None
+    def find_class(self, module: str, name: str) -> Any:
+        module = module.replace("numpy.core", "numpy._core")  # NumPy 2 has renamed the module
+        if (module, name) not in self.KNOWN:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no number or array")
+        return super().find_class(module, name)
