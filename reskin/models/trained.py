@@ -1,6 +1,6 @@
 """Read trained networks from disk, predict with them, and export them as ONNX."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +14,9 @@ from reskin import io
 from reskin.config import Strict, parse
 from reskin.data.rows import TARGETS
 from reskin.display import one_line
-from reskin.errors import ParamsError, SchemaError, missing_package, require
+from reskin.errors import ParamsError, SchemaError, require
 from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
+from reskin.models.onnx_graph import Graph
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
 
@@ -24,6 +25,7 @@ from reskin.numerics import device
 FORMAT = "reskin-model/3"
 UNIVERSAL = "reskin-universal"
 SUFFIX = ".safetensors"
+OUTPUT = "x_mm y_mm F_N"  # name of the output of the ONNX model
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -189,10 +191,6 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
 
 # --- ONNX ---
 
-OPSET, IR = 17, 8  # versions of ONNX's operators and file format; they are from 2022, and current runtimes support them
-INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"  # names of the input and of the output of the ONNX model
-Node = tuple[str, tuple[str, ...], str]  # a node of the graph: its operator, the names of its inputs, and of its output
-
 
 def write_onnx(network: Network, file: Path) -> None:
     """Write a network as an ONNX file. An existing file is replaced."""
@@ -200,79 +198,19 @@ def write_onnx(network: Network, file: Path) -> None:
 
 
 def build_onnx(network: Network) -> "ModelProto":
-    """Build the ONNX model of a network.
-
-    The model consists of the same steps as the network: it computes the view of the field change (see
-    `reskin.models.inputs`), scales the inputs, applies the layers, and converts the outputs to mm and N.
-    """
-    try:
-        from onnx import TensorProto, checker, helper, numpy_helper
-    except ImportError:
-        raise missing_package("onnx", "export_onnx") from None
+    """Build the ONNX model of a network, with the same steps as `Network.__call__`."""
+    g = Graph(np.float32)
     from reskin.models.network import LAYERS  # imported here, because it imports torch
 
-    card, scaler = network.card, dict(network.tensors)
-    channels_n = card["input"]["channels_n"]
-    layers = LAYERS[card["recipe"]["architecture"]](scaler["input_shift"].size)
-    nodes = [
-        *VIEW_NODES[card["recipe"]["inputs"]](),
-        *_scale_inputs(),
-        *_layers([layer.relu for layer in layers]),
-        *_scale_outputs(),
-    ]
-    node_protos = [
-        helper.make_node(operator, list(inputs), [output], **ATTRIBUTES.get(operator, {}))
-        for operator, inputs, output in nodes
-    ]
-    constants = {name: np.asarray(value, np.float32) for name, value in scaler.items()}
-    constants["floor_uT"] = np.array([DB_FLOOR_uT], np.float32)
-    graph = helper.make_graph(
-        node_protos, "reskin",
-        [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["f", channels_n])],
-        [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, ["f", scaler["target_shift"].size])],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
-    checker.check_model(model)
-    return model
-
-
-ATTRIBUTES: dict[str, dict[str, object]] = {
-    "Gemm": {"transB": 1}, "ReduceL2": {"axes": [1], "keepdims": 1}, "Concat": {"axis": 1},
-}  # fmt: skip
-
-
-def _raw() -> Iterator[Node]:
-    yield "Identity", (INPUT,), "view"
-
-
-def _shape() -> Iterator[Node]:
-    """Yield the nodes that compute view `shape`, as `reskin.models.inputs.shape` does.
-
-    The view consists of the direction of the field change and of the logarithm of its magnitude.
-    """
-    yield "ReduceL2", (INPUT,), "length_uT"
-    yield "Max", ("length_uT", "floor_uT"), "floored_uT"
-    yield "Div", (INPUT, "floored_uT"), "direction"
-    yield "Log", ("floored_uT",), "log_length"
-    yield "Concat", ("direction", "log_length"), "view"
-
-
-VIEW_NODES = {"raw": _raw, "shape": _shape}
-
-
-def _scale_inputs() -> Iterator[Node]:
-    yield "Sub", ("view", "input_shift"), "shifted"
-    yield "Div", ("shifted", "input_scale"), "features0"
-
-
-def _layers(relus: list[bool]) -> Iterator[Node]:
-    for i, relu in enumerate(relus, 1):
-        yield "Gemm", (f"features{i - 1}", f"layer{i}.weight", f"layer{i}.bias"), f"linear{i}"
-        yield ("Relu" if relu else "Identity"), (f"linear{i}",), f"features{i}"
-    yield "Identity", (f"features{len(relus)}",), "encoded"
-
-
-def _scale_outputs() -> Iterator[Node]:
-    yield "Mul", ("encoded", "target_scale"), "scaled"
-    yield "Add", ("scaled", "target_shift"), OUTPUT
+    card, tensors, value = network.card, network.tensors, "db_uT"
+    if card["recipe"]["inputs"] == "shape":  # as `reskin.models.inputs.shape`
+        length = g.add("Max", g.length(value), DB_FLOOR_uT)
+        value = g.add("Concat", g.add("Div", value, length), g.add("Log", length), axis=1)
+    value = g.add("Sub", value, g.constant(tensors["input_shift"]))
+    value = g.add("Div", value, g.constant(tensors["input_scale"]))
+    for i, layer in enumerate(LAYERS[card["recipe"]["architecture"]](tensors["input_shift"].size), 1):
+        value = g.affine(value, tensors[f"layer{i}.weight"].T, tensors[f"layer{i}.bias"])
+        value = g.add("Relu", value) if layer.relu else value
+    value = g.add("Mul", value, g.constant(tensors["target_scale"]))
+    g.add("Add", value, g.constant(tensors["target_shift"]), name=OUTPUT)
+    return g.build(card["input"]["channels_n"], {OUTPUT: [tensors["target_shift"].size]})

@@ -5,16 +5,16 @@ attends to a fixed context, and a correction of forces. `build_onnx` expresses t
 compute in double precision where the Python code uses single precision.
 """
 
-from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from reskin import io
 from reskin.data.contact import contact_threshold_uT, noise_uT
-from reskin.errors import SchemaError, missing_package
+from reskin.errors import SchemaError
+from reskin.models.onnx_graph import Graph
 from reskin.universal import force, network
 from reskin.universal.calibration import check_readings
 from reskin.universal.network import HEAD, HEADS_N, LAYERS_N, WIDTH
@@ -24,72 +24,9 @@ if TYPE_CHECKING:
 
     from reskin.universal.model import Calibrated, Universal
 
-OPSET, IR = 17, 8  # versions of the ONNX operators and of the file format, from 2022; current runtimes support them
 OUTPUTS = {  # name of each output: its shape for a single reading
     "place_mm": [2], "sd_mm": [2], "force_N": [], "sd_N": [], "change_uT": [], "contact": [],
 }  # fmt: skip
-
-
-class Graph:
-    """An ONNX graph under construction. Values of the graph are represented by their names."""
-
-    def __init__(self) -> None:
-        from onnx import TensorProto, helper, numpy_helper
-
-        self._make_node, self._from_array, self._double = helper.make_node, numpy_helper.from_array, TensorProto.DOUBLE
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-        self._number = count()
-
-    def constant(self, value: Any, dtype: type[np.generic] = np.float64) -> str:
-        """Add a constant."""
-        name = f"c{next(self._number)}"
-        self.constants.append(self._from_array(np.asarray(value, dtype), name))
-        return name
-
-    def single(self, value: np.ndarray) -> str:
-        """Add a constant that is stored in single precision and is converted to double precision for computations."""
-        return self.add("Cast", self.constant(value, np.float32), to=self._double)
-
-    def add(self, operator: str, *inputs: str | float, name: str | None = None, **attributes: Any) -> str:
-        """Add a node; inputs that are numbers become constants."""
-        output = f"v{next(self._number)}" if name is None else name
-        names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
-        self.nodes.append(self._make_node(operator, names, [output], **attributes))
-        return output
-
-    def reshape(self, value: str, *shape: int) -> str:
-        """Reshape a value; 0 keeps the length of an axis."""
-        return self.add("Reshape", value, self.constant(shape, np.int64))
-
-    def columns(self, value: str, first: int, end: int) -> str:
-        """Select columns of a value."""
-        return self.add("Slice", value, *(self.constant([number], np.int64) for number in (first, end, 1)))
-
-    def mean(self, value: str) -> str:
-        """Average over the last axis, which is kept."""
-        return self.add("ReduceMean", value, axes=[-1], keepdims=1)
-
-    def length(self, value: str) -> str:
-        """Return the norm over the last axis, which is kept."""
-        square = self.add("Mul", value, value)
-        return self.add("Sqrt", self.add("ReduceSum", square, self.constant([-1], np.int64), keepdims=1))
-
-    def affine(self, value: str, weight: np.ndarray, bias: np.ndarray) -> str:
-        """Multiply by a matrix with one row per input, and add a bias."""
-        return self.add("Add", self.add("MatMul", value, self.single(weight)), self.single(bias))
-
-    def bend(self, value: str) -> str:
-        """Apply hard swish."""
-        limited = self.add("Min", self.add("Max", self.add("Add", value, 3.0), 0.0), 6.0)
-        return self.add("Div", self.add("Mul", value, limited), 6.0)
-
-    def normalise(self, value: str, norm: np.ndarray) -> str:
-        """Apply a layer normalisation with these weights and biases."""
-        centred = self.add("Sub", value, self.mean(value))
-        variance = self.mean(self.add("Mul", centred, centred))
-        scaled = self.add("Div", centred, self.add("Sqrt", self.add("Add", variance, network.NORM_EPS)))
-        return self.add("Add", self.add("Mul", scaled, self.single(norm[0])), self.single(norm[1]))
 
 
 def write_onnx(model: "Universal", file: Path, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
@@ -101,10 +38,6 @@ def write_onnx(model: "Universal", file: Path, quiet_uT: Float[np.ndarray, "*f c
 
 def build_onnx(model: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> "ModelProto":
     """Convert the function of a calibrated model to an ONNX model; see `Universal.export_onnx`."""
-    try:
-        from onnx import TensorProto, checker, helper
-    except ImportError:
-        raise missing_package("onnx", "export_onnx") from None
     noload_uT, channels_n = model.noload_uT, model.channels_n
     suppressor = contact_uT = None
     if quiet_uT is not None:
@@ -114,7 +47,7 @@ def build_onnx(model: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None =
             raise SchemaError(f"{problem}. Pass the readings of about one second without contact.")
         suppressor = model.suppressor(noise_uT(quiet))
         contact_uT = contact_threshold_uT(quiet, suppressor)
-    g, outputs = Graph(), dict(OUTPUTS)
+    g, outputs = Graph(np.float64), dict(OUTPUTS)
     db_uT = g.add("MatMul", "db_uT", g.constant(model.layout.to_board(np.eye(channels_n))))
     scaled, sd = _normals(g, model.skin, db_uT)
     of_place = scaled if model.skin.refined is None else _normals(g, model.skin.refined, db_uT)[0]
@@ -137,17 +70,11 @@ def build_onnx(model: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None =
         del outputs["contact"]
     else:
         g.add("Greater", change_uT, contact_uT, name="contact")
-    types = {name: TensorProto.BOOL if name == "contact" else TensorProto.DOUBLE for name in outputs}
-    graph = helper.make_graph(
-        g.nodes, "reskin",
-        [helper.make_tensor_value_info("db_uT", TensorProto.DOUBLE, ["f", channels_n])],
-        [helper.make_tensor_value_info(name, types[name], ["f", *shape]) for name, shape in outputs.items()],
-        g.constants,
-    )  # fmt: skip
-    built = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
+    built = g.build(channels_n, outputs, of_bool=["contact"])
+    from onnx import helper  # imported here, because the package is optional
+
     about = {"board": model.layout.name, "presses_n": str(model.presses_n), "external_uT": f"{model.external_uT:g}"}
     helper.set_model_props(built, about | {"noload_uT": " ".join(f"{value:.9g}" for value in noload_uT)})
-    checker.check_model(built)
     return built
 
 
@@ -159,7 +86,7 @@ def _normals(g: Graph, skin: "Calibrated", db_uT: str) -> tuple[str, str]:
     inputs = g.add("Concat", direction, g.add("Sub", g.add("Log", length), network.LOG_uT), axis=1)
     token = g.affine(g.bend(g.affine(inputs, compiled.embed[0], context.shared)), *compiled.embed[1:])
     for i in range(LAYERS_N):
-        normed = g.normalise(token, compiled.norms[2 * i])
+        normed = g.normalise(token, compiled.norms[2 * i], network.NORM_EPS)
         asked = g.affine(normed, compiled.query[0][i], compiled.query[1][i])
         asked = g.reshape(asked, 0, HEADS_N, 1, HEAD)
         keys = context.keys[i].reshape(HEADS_N, HEAD, -1)
@@ -167,9 +94,11 @@ def _normals(g: Graph, skin: "Calibrated", db_uT: str) -> tuple[str, str]:
         share = g.add("Softmax", g.add("MatMul", asked, g.single(keys)), axis=-1)
         read = g.reshape(g.add("MatMul", share, g.single(values)), 0, WIDTH)
         token = g.add("Add", token, g.affine(read, compiled.mix[0][i], compiled.mix[1][i]))
-        hidden = g.affine(g.normalise(token, compiled.norms[2 * i + 1]), compiled.mlp[0][i], compiled.mlp[1][i])
+        hidden = g.affine(
+            g.normalise(token, compiled.norms[2 * i + 1], network.NORM_EPS), compiled.mlp[0][i], compiled.mlp[1][i]
+        )
         token = g.add("Add", token, g.affine(g.bend(hidden), compiled.mlp[2][i], compiled.mlp[3][i]))
-    out = g.affine(g.normalise(token, compiled.norms[-1]), *compiled.out[:2])
+    out = g.affine(g.normalise(token, compiled.norms[-1], network.NORM_EPS), *compiled.out[:2])
     out = g.affine(g.bend(out), *compiled.out[2:])
     low, high = network.LOG_SD
     return g.columns(out, 0, 3), g.add("Exp", g.add("Min", g.add("Max", g.columns(out, 3, 6), low), high))
