@@ -17,7 +17,6 @@ from reskin.data.contact import CONTACT_SDS
 from reskin.errors import SchemaError
 from reskin.universal.layout import BoardLayout
 
-CHANNELS_N = 15  # values in one reading of the paper's board, which has five chips with three axes each
 # Largest accepted field, which is 20 times the range of a chip. The square of this value can be represented in single
 # precision.
 FIELD_MAX_uT = 1e6
@@ -29,7 +28,7 @@ LABELS_MAX_N = 1000
 UNLABELLED_MAX_N = 65  # a calibration uses the latest presses at unknown places, at most this number
 
 
-def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
+def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int) -> Float[np.ndarray, "f ch"]:
     """Return one or several readings as a 2-D array with one row per reading.
 
     Raises SchemaError if the values are not an array of numbers of this shape.
@@ -46,7 +45,7 @@ def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) ->
     return rows_uT
 
 
-def check_readings(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
+def check_readings(b_uT: Float[np.ndarray, "..."], channels_n: int) -> Float[np.ndarray, "f ch"]:
     """Return calibration readings as a 2-D array with one row per reading.
 
     Raises SchemaError if the shape is wrong, if a value is not finite, or if a magnitude exceeds `FIELD_MAX_uT`.

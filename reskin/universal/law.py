@@ -5,14 +5,16 @@ N, unless a name states another one.
 """
 
 from dataclasses import asdict, dataclass
-from functools import cache, cached_property
+from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pydantic import Field
 from scipy.constants import kilo, mega, micro, milli
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from reskin.config import Strict
 from reskin.physics import deformation, magnet, slide
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
@@ -22,18 +24,19 @@ MARGIN_MM = 0.4  # width of a margin around the area of presses; places in the m
 # `CORNER_MM`.
 HALF_MM, CORNER_MM = 8.0, 12.0
 
+Length = Annotated[float, Field(gt=0, le=200)]
 
-@dataclass(frozen=True)
-class Area:
+
+class Area(Strict):
     """The area in which a skin is pressed: a rectangle or an octagon around the board's centre.
 
     `half_x_mm` and `half_y_mm` are the largest |x| and |y|. If `octagon` is set, the corners of the rectangle are cut
     off so that the area has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
     """
 
-    half_x_mm: float = HALF_MM
-    half_y_mm: float = HALF_MM
-    octagon: bool = True
+    half_x_mm: Length
+    half_y_mm: Length
+    octagon: bool
 
     @property
     def half_mm(self) -> Float[np.ndarray, "2"]:
@@ -41,7 +44,7 @@ class Area:
         return np.array([self.half_x_mm, self.half_y_mm])
 
 
-PAPER_AREA = Area()
+PAPER_AREA = Area(half_x_mm=HALF_MM, half_y_mm=HALF_MM, octagon=True)
 
 
 def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[np.ndarray, " n"]:
@@ -270,25 +273,3 @@ def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, 
 
 # Law at which fits start by default; it is also the mean of the priors of the fitted parameters.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
-
-
-def to_board(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...]) -> Float[np.ndarray, "f ch"]:
-    """Convert readings along the chips' axes to readings along the board's axes.
-
-    `turns_deg` contains the rotation of each chip about z.
-    """
-    return b_uT @ _turn(turns_deg)
-
-
-def to_chips(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...]) -> Float[np.ndarray, "f ch"]:
-    """Convert readings along the board's axes to readings along the chips' axes.
-
-    `turns_deg` contains the rotation of each chip about z.
-    """
-    return b_uT @ _turn(turns_deg).T
-
-
-@cache
-def _turn(turns_deg: tuple[float, ...]) -> Float[np.ndarray, "ch ch"]:
-    of_chips = Rotation.from_euler("z", np.array(turns_deg)[:, None], degrees=True).as_matrix()
-    return np.array(block_diag(*of_chips)).T

@@ -4,13 +4,15 @@ A user writes a layout as a YAML file. The file `reskin/layouts/reskin.yaml` is 
 """
 
 import math
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import did_you_mean
@@ -21,15 +23,13 @@ from reskin.physics.magnet import Polarity, Quadrature
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
 from reskin.simulation.defaults import filler
-from reskin.universal.law import COARSE, RULE, START, Area, Law, Setup, to_board, to_chips, with_parameters
+from reskin.universal.law import COARSE, RULE, START, Area, Law, Length, Setup, with_parameters
 from reskin.universal.population import NOMINAL, NOMINAL_SPREADS, THICKNESSES, TIPS, Forces
 
 CHIPS_APART_MM = 0.5  # smallest distance between the centres of two chips, which is less than the width of a chip
 EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
 # Side of the paper's skin. For larger skins, the cells of the quadrature rule are larger in proportion.
 SIDE_MM = 20.0
-
-Length = Annotated[float, Field(gt=0, le=200)]
 
 
 class SkinStack(Strict):
@@ -44,14 +44,6 @@ class SkinStack(Strict):
     modulus_MPa: Annotated[float, Field(gt=0, le=100)]
 
 
-class PressArea(Strict):
-    """The places that may be pressed: a rectangle around the board's centre or, if `octagon` is set, an octagon."""
-
-    half_x_mm: Length
-    half_y_mm: Length
-    octagon: bool
-
-
 class BoardLayout(Strict):
     """Everything about a board and its skin that the universal model must know before training."""
 
@@ -61,7 +53,7 @@ class BoardLayout(Strict):
     gap_mm: Annotated[float, Field(ge=0.8, le=20)]  # distance from the sensing plane of the chips to the skin
     skin: SkinStack
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
-    area: PressArea
+    area: Area
     # Smallest and largest force.
     force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
     # Standard deviations of some parameters of the law (`reskin.universal.law`) over skins. For all other parameters,
@@ -113,11 +105,6 @@ class BoardLayout(Strict):
     def half_mm(self) -> tuple[float, float]:
         """Largest |x| and |y| of presses, relative to the board's centre."""
         return self.area.half_x_mm, self.area.half_y_mm
-
-    @property
-    def places(self) -> Area:
-        """The places that may be pressed."""
-        return Area(*self.half_mm, self.area.octagon)
 
     @property
     def chips_mm(self) -> Float[np.ndarray, "k 2"]:
@@ -174,16 +161,22 @@ class BoardLayout(Strict):
         rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
         return Setup(
             design, self.chips_mm, self.gap_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse,
-            self.places, with_parameters(START, *self._own_parameters),
+            self.area, with_parameters(START, *self._own_parameters),
         )  # fmt: skip
 
     def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
         """Convert readings along the chips' axes to readings along the board's axes."""
-        return to_board(b_uT, self.turns_deg)
+        return b_uT @ _board_from_chips(self.turns_deg)
 
     def to_chips(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
         """Convert readings along the board's axes to readings along the chips' axes."""
-        return to_chips(b_uT, self.turns_deg)
+        return b_uT @ _board_from_chips(self.turns_deg).T
+
+
+@cache
+def _board_from_chips(turns_deg: tuple[float, ...]) -> Float[np.ndarray, "ch ch"]:
+    of_chips = Rotation.from_euler("z", np.array(turns_deg)[:, None], degrees=True).as_matrix()
+    return np.array(block_diag(*of_chips)).T
 
 
 def read_layout(file: Path | str) -> BoardLayout:
@@ -209,7 +202,7 @@ def as_layout(value: Any, where: str) -> BoardLayout:
     return parse(BoardLayout, value, where)
 
 
-@lru_cache(maxsize=1)
+@cache
 def paper_layout() -> BoardLayout:
     """Return the layout of the paper's board."""
     return read_layout(PAPER)

@@ -37,14 +37,14 @@ def test_layouts_of_the_project_can_be_simulated(name):
 
 
 def test_grid_is_scaled_to_the_area_and_octagons_exclude_its_corners():
-    wide = law.Area(12.0, 6.0)
+    wide = law.Area(half_x_mm=12.0, half_y_mm=6.0, octagon=True)
     np.testing.assert_array_equal(grid(wide), grid() * [1.5, 0.75])
     inner_mm = np.random.default_rng(0).uniform(-1, 1, (500, 2)) * [12.0, 6.0]
     octagon = (np.abs(inner_mm) / [12.0, 6.0]).sum(axis=1) <= 1.5
     found = law.inside(inner_mm, wide)
     assert found[octagon].all()
     assert not found.all()
-    assert law.inside(inner_mm, law.Area(12.0, 6.0, octagon=False)).all()
+    assert law.inside(inner_mm, law.Area(half_x_mm=12.0, half_y_mm=6.0, octagon=False)).all()
     assert law.inside(draw_places(np.random.default_rng(1), wide), wide).all()
 
 

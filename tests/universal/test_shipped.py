@@ -17,10 +17,12 @@ from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation import defaults
-from reskin.universal.calibration import CHANNELS_N, LABELS_MAX_N
+from reskin.universal.calibration import LABELS_MAX_N
 from reskin.universal.episodes import NOISE_uT
 from reskin.universal.model import FILE, Universal, folds_of, load_universal, thin
 from tests.universal.skins import draw
+
+CHANNELS_N = 15
 
 PARAMS = {name: defaults.nominal(name) for name in defaults.SHARED}
 PARAMS_SKIN, SPREADS = parse(SkinDesign, PARAMS["skin"], "skin"), parse(Spreads, PARAMS["spreads"], "spreads")
