@@ -41,26 +41,17 @@ RATE_OF_TUNING = 3e-4  # largest learning rate if a trained network is trained f
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
 
 
-class SkinReader(nn.Module):
-    """The network of `reskin.universal.network` as a PyTorch module, with weights of the same names."""
+class SkinReader:
+    """The network of `reskin.universal.network` in PyTorch, with weights of the same names."""
 
     def __init__(self, weights: Weights) -> None:
-        super().__init__()
-        self.names = {name: name.replace(".", "_") for name in weights}
-        fixed = "usual_rest"
-        self.register_buffer(fixed, torch.from_numpy(np.array(weights[fixed], np.float32)))
-        for name, value in weights.items():
-            if name != fixed:
-                self.register_parameter(self.names[name], nn.Parameter(torch.from_numpy(np.array(value, np.float32))))
+        self.weights = {name: torch.tensor(value, dtype=torch.float32) for name, value in weights.items()}
+        self.trained = [weight.requires_grad_() for name, weight in self.weights.items() if name != "usual_rest"]
 
-    def weights(self) -> dict[str, np.ndarray]:
-        """Return the weights as arrays."""
-        return {name: self._weight(name).detach().numpy().copy() for name in self.names}
-
-    def forward(self, episodes: Episodes) -> tuple[Float[torch.Tensor, "b q 3"], Float[torch.Tensor, "b q 3"]]:
+    def __call__(self, episodes: Episodes) -> tuple[Float[torch.Tensor, "b q 3"], Float[torch.Tensor, "b q 3"]]:
         """Estimate scaled x, y and log F of the readings; return means and logarithms of standard deviations."""
         rest = torch.from_numpy(episodes.rest_uT)
-        sign = torch.where(rest @ self._weight("usual_rest") < 0, -1.0, 1.0)[:, None]
+        sign = torch.where(rest @ self.weights["usual_rest"] < 0, -1.0, 1.0)[:, None]
         ambient = sign * rest / REST_uT
         ambient = torch.cat([ambient, torch.full_like(sign, math.log1p(episodes.external_uT / EXTERNAL_uT))], 1)
         context, query = (
@@ -70,7 +61,7 @@ class SkinReader(nn.Module):
         labels = torch.from_numpy(episodes.labels)
         labels_n = labels.shape[1]
         of_labels = self._linear("label2", hardswish(self._linear("label1", labels)))
-        empty = self._weight("empty").expand(len(rest), 1, WIDTH)
+        empty = self.weights["empty"].expand(len(rest), 1, WIDTH)
         context = torch.cat([empty, context[:, :labels_n] + of_labels, context[:, labels_n:]], 1)
         for i in range(LAYERS_N):
             source = self._norm(f"layer{i}.norm1", context)
@@ -101,15 +92,10 @@ class SkinReader(nn.Module):
         return values.view(*values.shape[:2], HEADS_N, HEAD).transpose(1, 2)
 
     def _linear(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        return linear(values, self._weight(f"{name}.weight"), self._weight(f"{name}.bias"))
+        return linear(values, self.weights[f"{name}.weight"], self.weights[f"{name}.bias"])
 
     def _norm(self, name: str, values: torch.Tensor) -> torch.Tensor:
-        return layer_norm(values, (WIDTH,), self._weight(f"{name}.weight"), self._weight(f"{name}.bias"))
-
-    def _weight(self, name: str) -> torch.Tensor:
-        weight = getattr(self, self.names[name])
-        assert isinstance(weight, torch.Tensor)
-        return weight
+        return layer_norm(values, (WIDTH,), self.weights[f"{name}.weight"], self.weights[f"{name}.bias"])
 
 
 def draw_weights(usual_rest_uT: Float[np.ndarray, " ch"], rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -158,7 +144,7 @@ def _train(
 ) -> dict[str, np.ndarray]:
     rate_max = RATE_MAX if start is None else RATE_OF_TUNING
     network = SkinReader(draw_weights(skins.rest_uT.mean(axis=0), rng) if start is None else start)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=rate_max, weight_decay=WEIGHT_DECAY)
+    optimizer = torch.optim.AdamW(network.trained, lr=rate_max, weight_decay=WEIGHT_DECAY)
     for step_i in tqdm(range(steps_n), desc="training", mininterval=10, disable=steps_n < 1000):
         warm = min(1.0, (step_i + 1) / min(WARM_UP_N, steps_n / 4))
         rate = rate_max * warm * 0.5 * (1 + math.cos(math.pi * step_i / steps_n)) + 1e-6
@@ -167,9 +153,9 @@ def _train(
         loss = loss_of(network, draw_episodes(skins, recorded, rng))
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_NORM_MAX)
+        nn.utils.clip_grad_norm_(network.trained, GRADIENT_NORM_MAX)
         optimizer.step()
-    return network.weights()
+    return {name: weight.detach().numpy() for name, weight in network.weights.items()}
 
 
 def loss_of(network: SkinReader, episodes: Episodes) -> torch.Tensor:
