@@ -256,12 +256,13 @@ class Universal:
         self._noload_uT: Float[np.ndarray, " ch"] | None = None
         self._contact_uT: float | None = None  # larger field changes are contacts; None if the noise is unknown
         self._saved_uT: Float[np.ndarray, " ch"] | None = None  # no-load reading of the skin that was loaded
-        self._skin: Calibrated
+        # The network with the skin to which it is calibrated, in the frame and the axes of the board.
+        self.skin: Calibrated
         self._set(SkinData.at_rest(np.array(self.weights["usual_rest"], float)))
 
     def __repr__(self) -> str:
         noload = "no-load reading taken" if self.zeroed else "no no-load reading"
-        labels_n, refined = self.labels_n, ", refined" if self._skin.data.refined else ""
+        labels_n, refined = self.labels_n, ", refined" if self.skin.data.refined else ""
         external_uT = f", external fields of {self.external_uT:g} uT" if self.external_uT else ""
         return (
             f"Universal(board {self.layout.name}, {len(self.layout.chips)} chips, {noload}, "
@@ -272,11 +273,6 @@ class Universal:
     def channels_n(self) -> int:
         """Number of values in one reading, which has three values per chip."""
         return self.layout.channels_n
-
-    @property
-    def skin(self) -> Calibrated:
-        """The network with the skin to which it is calibrated, in the frame and the axes of the board."""
-        return self._skin
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
@@ -296,17 +292,17 @@ class Universal:
     @property
     def presses_n(self) -> int:
         """Number of presses to which the model is calibrated, labelled or not."""
-        return len(self._skin.data.presses_uT) + self.labels_n
+        return len(self.skin.data.presses_uT) + self.labels_n
 
     @property
     def labels_n(self) -> int:
         """Number of labelled presses to which the model is calibrated."""
-        return len(self._skin.data.labels)
+        return len(self.skin.data.labels)
 
     @property
     def refinable(self) -> bool:
         """Whether there are enough labels with known forces for `refine`."""
-        return int(np.isfinite(self._skin.data.labels.force_N).sum()) >= REFINE_MIN_N
+        return int(np.isfinite(self.skin.data.labels.force_N).sum()) >= REFINE_MIN_N
 
     @property
     def reach_mm(self) -> Float[np.ndarray, "2 2"]:
@@ -324,7 +320,7 @@ class Universal:
                 f"the no-load field is weaker than the earth's field: its median over the chips is {usual_uT:.3g} uT. "
                 "Convert readings in mT or G to uT, and do not subtract the no-load reading from them."
             ]
-        found, data = [], self._skin.data
+        found, data = [], self.skin.data
         sign = network.sign_of(self.weights, data.rest_uT)
         pressed_uT = np.concatenate([data.presses_uT, data.labels.db_uT])
         misfit = self.likeness.skin_misfit(sign * data.rest_uT, sign * pressed_uT)
@@ -352,7 +348,7 @@ class Universal:
         if len(data.labels) < LABELS_MIN_N:
             return found
         place_mm = data.labels.place_mm
-        estimated_mm = network.estimate(self._compiled, self._skin.unlabelled_context, data.labels.db_uT).place_mm
+        estimated_mm = network.estimate(self._compiled, self.skin.unlabelled_context, data.labels.db_uT).place_mm
         off_mm = float(np.median(np.linalg.norm(estimated_mm - place_mm, axis=1)))
         span_mm, estimated_span_mm = (float(np.ptp(places, axis=0).max()) for places in (place_mm, estimated_mm))
         if off_mm <= self.references.labels_mm:
@@ -407,7 +403,7 @@ class Universal:
         self._contact_uT = contact_threshold_uT(readings_uT - self._noload_uT, None) if enough else None
         self._saved_uT = self._saved_uT if kept else None
         rest_uT = self.layout.to_board(self._noload_uT[None])[0]
-        self._set(replace(self._skin.data, rest_uT=rest_uT) if kept else SkinData.at_rest(rest_uT))
+        self._set(replace(self.skin.data, rest_uT=rest_uT) if kept else SkinData.at_rest(rest_uT))
         return self
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, changes: bool = False) -> "Universal":
@@ -420,7 +416,7 @@ class Universal:
         reading, unless `changes` is set.
         """
         db_uT = self._check_change("see", check_readings(b_uT, self.channels_n), changes)
-        self._set(self._skin.data.and_seen(db_uT), self._skin.judge if self.labels_n else None)
+        self._set(self.skin.data.and_seen(db_uT), self.skin.judge if self.labels_n else None)
         return self
 
     def label(
@@ -458,7 +454,7 @@ class Universal:
         )
         db_uT = self._check_change("label", readings_uT, changes)
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT)
-        data = self._skin.data
+        data = self.skin.data
         if keep:
             labels = labels.joined_to(data.labels)
         else:
@@ -478,7 +474,7 @@ class Universal:
         ------
         SchemaError : there are fewer than `REFINE_MIN_N` labels with known forces
         """
-        data = self._skin.data
+        data = self.skin.data
         known = np.flatnonzero(np.isfinite(data.labels.force_N))
         if len(known) < REFINE_MIN_N:
             rule = f"at least {REFINE_MIN_N} labels with known forces"
@@ -492,7 +488,7 @@ class Universal:
 
     def use_refined(self, weights: Weights) -> "Universal":
         """Use a network that `refine` trained for this skin; the model is changed in place and returned."""
-        self._set(replace(self._skin.data, refined=weights))
+        self._set(replace(self.skin.data, refined=weights))
         return self
 
     def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
@@ -509,12 +505,12 @@ class Universal:
         contact, place and force mean nothing.
         """
         db_uT = self._change(b_uT, changes)
-        estimate = self._skin.estimate(db_uT)
+        estimate = self.skin.estimate(db_uT)
         return replace(estimate, place_mm=estimate.place_mm + self._centre_mm, contact=self._contact(db_uT))
 
     def misfit(self, b_uT: Float[np.ndarray, "*f ch"], *, changes: bool = False) -> Float[np.ndarray, " f"]:
         """Return how unlike those of simulated skins readings in contact are: above `MISFIT_MAX`, they are unusual."""
-        sign = network.sign_of(self.weights, self._skin.data.rest_uT)
+        sign = network.sign_of(self.weights, self.skin.data.rest_uT)
         return self.likeness.misfit(sign * self._change(b_uT, changes))
 
     def save(self, file: Path | str) -> None:
@@ -524,8 +520,8 @@ class Universal:
         """
         if not self.zeroed:
             raise SchemaError("save: the model has no no-load reading. First call zero with readings without contact.")
-        write_skin(self._skin.data, Path(file), self.layout.name)
-        self._set(self._skin.data)  # from now on, estimates are those of a model that reads the file
+        write_skin(self.skin.data, Path(file), self.layout.name)
+        self._set(self.skin.data)  # from now on, estimates are those of a model that reads the file
 
     def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
         """Write the calibrated model as an ONNX file, so that programs without Python can use it (docs/python.md).
@@ -592,7 +588,7 @@ class Universal:
         return db_uT
 
     def _set(self, data: SkinData, judged: Judge | None = None) -> None:
-        self._skin = Calibrated(self.weights, self._compiled, data, self.references, self.external_uT, judged)
+        self.skin = Calibrated(self.weights, self._compiled, data, self.references, self.external_uT, judged)
 
 
 def load_universal(skin: Path | str | None = None, *, file: Path | str = FILE, external_uT: float = 0.0) -> Universal:
