@@ -8,7 +8,7 @@ time. The dataset is a folder with these files:
     meta/tasks.parquet                          the task
     meta/episodes/chunk-000/file-000.parquet    length, file and statistics of each episode
     meta/reskin.json                            recording, board, skin and source of each episode (not read by LeRobot)
-    data/chunk-000/file-000.parquet, ...        one row per frame
+    data/chunk-000/file-000.parquet             one row per frame
 
 A feature is a named array with one row per frame. The names of features that a robot's sensors measure begin with
 `observation.`, so that policies use these features as inputs. The names of features that a rig measured (place, depth,
@@ -16,6 +16,7 @@ force) begin with `label.`; LeRobot loads these features, but policies do not us
 """
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,8 +41,8 @@ RATE_TOLERANCE = 0.05  # rates of recordings are treated as equal if their relat
 ROUNDING = 1e-6  # tolerance when times are compared, as a fraction of the time between frames
 # If the time between two readings is longer than this, the earlier reading becomes outdated, so an episode ends there.
 GAP_S = 0.3
-FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
-PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+LIMITS = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}  # for frames added later
+PATH, FIRST = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", {"chunk_index": 0, "file_index": 0}
 QUANTILES = {f"q{percent:02d}": percent / 100 for percent in (1, 10, 50, 90, 99)}
 FIELD, NOLOAD, TEMPERATURE = "observation.field_uT", "observation.noload_uT", "observation.temperature_degC"
 LABELS = {
@@ -318,62 +319,45 @@ def split(
 # --- Writing ---
 
 
-# a mapping from the name of a feature to its values in the frames of an episode
-Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]
-
-
 def write_dataset(
     folder: Path, episodes: Sequence[Episode], features: Mapping[str, Sequence[str]], task: str, fps: int
 ) -> None:
-    """Write all files of a dataset to a new folder."""
+    """Write all files of a dataset to a new folder. All frames are in one file, whatever its size."""
     described: dict[str, Any] = {
         name: {"dtype": "float32", "shape": [len(parts)], "names": list(parts)} for name, parts in features.items()
     }
     described |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in INDICES.items()}
     starts = np.cumsum([0, *map(len, episodes)]).tolist()
-    columns = [_columns(episode, i, starts[i], fps) for i, episode in enumerate(episodes)]
-    numbers = _file_numbers([sum(values.nbytes for values in each.values()) for each in columns])
-    for number in sorted(set(numbers)):
-        tables = [_table(each) for each, own in zip(columns, numbers, strict=True) if own == number]
-        io.write_table(folder / "data" / PATH.format(**_location(number)), pa.concat_tables(tables))
-    rows = []
-    for i, each in enumerate(columns):
-        row: dict[str, Any] = {"episode_index": i, "tasks": [task], "length": len(episodes[i])}
+    columns, rows = [], []
+    for i, episode in enumerate(episodes):
+        frame_i = np.arange(len(episode))[:, None]
+        indices = {
+            "timestamp": frame_i / fps, "frame_index": frame_i, "episode_index": np.full_like(frame_i, i),
+            "index": starts[i] + frame_i, "task_index": np.zeros_like(frame_i),
+        }  # fmt: skip
+        columns.append(dict(episode.values) | {name: indices[name].astype(dtype) for name, dtype in INDICES.items()})
+        row: dict[str, Any] = {"episode_index": i, "tasks": [task], "length": len(episode)}
         row |= {"dataset_from_index": starts[i], "dataset_to_index": starts[i + 1]}
-        row |= {f"data/{key}": index for key, index in _location(numbers[i]).items()}
-        row |= {f"meta/episodes/{key}": index for key, index in _location(0).items()}
-        for name, values in each.items():
+        row |= {f"{kind}/{key}": number for kind in ("data", "meta/episodes") for key, number in FIRST.items()}
+        for name, values in columns[-1].items():
             row |= {f"stats/{name}/{key}": value for key, value in statistics(values).items()}
         rows.append(row)
-    io.write_table(folder / "meta/episodes" / PATH.format(**_location(0)), pa.Table.from_pylist(rows))
-    io.write_table(folder / "meta/tasks.parquet", _task_table(task))
     joined = {name: np.concatenate([each[name] for each in columns]) for name in described}
+    io.write_table(folder / "data" / PATH.format(**FIRST), _frame_table(joined))
+    io.write_table(folder / "meta/episodes" / PATH.format(**FIRST), pa.Table.from_pylist(rows))
+    io.write_table(folder / "meta/tasks.parquet", _task_table(task))
     io.write_json(folder / "meta/stats.json", {name: statistics(values) for name, values in joined.items()})
     io.write_json(folder / "meta/reskin.json", {"episodes": [dict(episode.about) for episode in episodes]})
     info = {
         "codebase_version": VERSION, "robot_type": "reskin", "total_episodes": len(episodes),
-        "total_frames": starts[-1], "total_tasks": 1, "chunks_size": FILES_PER_CHUNK_N,
-        "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": VIDEO_FILE_MB, "fps": fps,
+        "total_frames": starts[-1], "total_tasks": 1, **LIMITS, "fps": fps,
         "splits": {"train": f"0:{len(episodes)}"}, "data_path": f"data/{PATH}", "video_path": None,
         "features": described,
     }  # fmt: skip
     io.write_json(folder / "meta/info.json", info)
 
 
-def _columns(episode: Episode, episode_i: int, start: int, fps: int) -> Columns:
-    """Return the values of all features of an episode, including LeRobot's indices and timestamps.
-
-    `episode_i` is the index of the episode, and `start` is the index of its first frame in the dataset.
-    """
-    frame_i = np.arange(len(episode))[:, None]
-    indices = {
-        "timestamp": frame_i / fps, "frame_index": frame_i, "episode_index": np.full_like(frame_i, episode_i),
-        "index": start + frame_i, "task_index": np.zeros_like(frame_i),
-    }  # fmt: skip
-    return dict(episode.values) | {name: indices[name].astype(dtype) for name, dtype in INDICES.items()}
-
-
-def _table(columns: Columns) -> pa.Table:
+def _frame_table(columns: Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]) -> pa.Table:
     """Convert the values of features to a table with one row per frame.
 
     A feature with one component becomes a column of numbers; other features become columns of lists of fixed length.
@@ -385,65 +369,24 @@ def _table(columns: Columns) -> pa.Table:
     return pa.table(arrays)
 
 
-def _file_numbers(bytes_n: Sequence[int]) -> list[int]:
-    """Return the number of the data file to which each episode is written.
-
-    `bytes_n` is the size of each episode. Successive episodes share a file, as long as their total size is at most
-    `FILE_MB`.
-    """
-    numbers, size_n, number = [], 0, 0
-    for episode_bytes_n in bytes_n:
-        if size_n and size_n + episode_bytes_n > FILE_MB * 2**20:
-            size_n, number = 0, number + 1
-        size_n += episode_bytes_n
-        numbers.append(number)
-    return numbers
-
-
-def _location(number: int) -> dict[str, int]:
-    return {"chunk_index": number // FILES_PER_CHUNK_N, "file_index": number % FILES_PER_CHUNK_N}
-
-
 def statistics(values: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"]) -> dict[str, list[float] | list[int]]:
     """Return the statistics that LeRobot stores for a feature, with one value for each component.
 
     Unknown values (NaN) are ignored. If all values of a component are unknown, its statistics are NaN.
     """
-    known, count = np.isfinite(values), {"count": [len(values)]}
-    if known.all():
-        return count | {key: value.tolist() for key, value in _statistics(values).items()}
-    parts = [_statistics(column[mask, None]) for column, mask in zip(values.T, known.T, strict=True)]
-    return count | {key: np.concatenate([part[key] for part in parts]).tolist() for key in parts[0]}
-
-
-def _statistics(
-    known: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"],
-) -> dict[str, Float[np.ndarray, " n"] | Int[np.ndarray, " n"]]:
-    if not len(known):
-        return {key: np.full(known.shape[1], np.nan) for key in ("min", "max", "mean", "std", *QUANTILES)}
-    exact = known.astype(float)
-    quantiles = np.quantile(exact, list(QUANTILES.values()), axis=0)
-    moments = {"min": known.min(axis=0), "max": known.max(axis=0), "mean": exact.mean(axis=0), "std": exact.std(axis=0)}
-    return moments | dict(zip(QUANTILES, quantiles, strict=True))
+    exact = values.astype(float)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NumPy warns if all values are NaN
+        least, greatest = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+        moments = [least, greatest, np.nanmean(exact, axis=0), np.nanstd(exact, axis=0)]
+        quantiles = np.nanquantile(exact, list(QUANTILES.values()), axis=0)
+    names = ("min", "max", "mean", "std", *QUANTILES)
+    return {"count": [len(values)]} | {name: v.tolist() for name, v in zip(names, [*moments, *quantiles], strict=True)}
 
 
 def _task_table(task: str) -> pa.Table:
-    """Return the table of tasks, with the metadata that pandas would write.
-
-    When pandas reads the table, the text of the task becomes the index of the data frame instead of a column.
-    """
+    """Return the table of tasks. When pandas reads it, the text of the task becomes the index of the data frame."""
     index = "__index_level_0__"
-    kinds = {"task_index": ("int64", "int64"), index: ("unicode", "object")}
-    described = [
-        {
-            "name": None if name == index else name,
-            "field_name": name,
-            "pandas_type": kind,
-            "numpy_type": dtype,
-            "metadata": None,
-        }
-        for name, (kind, dtype) in kinds.items()
-    ]
-    metadata = {"index_columns": [index], "column_indexes": [], "columns": described}
+    described = {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    metadata = {"index_columns": [index], "column_indexes": [], "columns": [described]}
     table = pa.table({"task_index": pa.array([0], pa.int64()), index: [task]})
     return table.replace_schema_metadata({"pandas": json.dumps(metadata)})
