@@ -2,11 +2,11 @@
 
 import re
 import threading
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,6 @@ from reskin.errors import DISK_REMEDIES, ParamsError, SchemaError
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import SUFFIX, Network
 from reskin.recordings.header import NAME
-from reskin.universal.calibration import check_presses
 from reskin.universal.model import FILE, MISFIT_MAX, Estimate, Universal
 
 # A reading is outside a network's training distribution if one of the network's inputs is larger than this number of
@@ -89,48 +88,24 @@ class NetworkEstimator:
         return {"model": model, "expected": expected, "least_force": NOT_MEASURED}
 
 
-class Labels(NamedTuple):
-    """The labels and the field changes of m presses at known places."""
+class Step(NamedTuple):
+    """A step of the calibration, and the model after it."""
 
-    place_mm: Float64[np.ndarray, "m 2"]
-    force_N: Float64[np.ndarray, " m"]  # NaN if the force is unknown
-    db_uT: Float64[np.ndarray, "m ch"]
-
-    def followed_by(self, other: "Labels") -> "Labels":
-        return Labels(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
-
-
-class LearningState(NamedTuple):
-    """The calibration data of a `UniversalEstimator` after one calibration step, except for the no-load reading."""
-
-    origin: Universal  # the model before the calibration, which was passed to the estimator or loaded from a file
-    origin_name: str  # the name of the saved skin that was loaded; empty if none was loaded
-    presses_uT: Float64[np.ndarray, "n ch"]  # field changes of presses at unknown places
-    guided: Labels  # presses at places that the page showed
-    typed: Labels  # presses whose places the user entered
-    step: str  # description of the calibration step, such as "the 12 presses"
-    refined: Mapping[str, np.ndarray] = MappingProxyType({})  # weights of the network, if it was refined on the page
-
-    @property
-    def labels(self) -> Labels:
-        return self.guided.followed_by(self.typed)
-
-    @classmethod
-    def start(cls, origin: Universal, origin_name: str = "", step: str = "") -> "LearningState":
-        """Return the state of a model that has not yet been calibrated to presses on the page."""
-        none_uT = np.zeros((0, origin.channels_n))
-        none = Labels(np.zeros((0, 2)), np.zeros(0), none_uT)
-        return cls(origin, origin_name, none_uT, none, none, step)
+    kind: str  # which presses the step adds, such as "anywhere"
+    what: str  # description of the step, such as "calibration to 12 presses"
+    model: Universal
+    presses_n: Mapping[str, int]  # number of presses of each kind that the model knows
+    skin: str = ""  # name of the saved skin that was loaded last
 
 
 class UniversalEstimator:
     """An estimator that uses a universal model, and calibrates it to the skin while the board is running.
 
-    The estimator calibrates a copy of the model. The model that was passed is not changed. The calibration uses the
-    no-load reading, presses at unknown places (`adapt`) and presses at known places (`label` and `add_label`). If
-    `adapt` or `label` is called again, the new presses replace those of the earlier call, so that the user can repeat
-    bad presses. `undo` reverts the last calibration step. Each step returns a text for the user. It raises SchemaError
-    if its data cannot be used, such as presses within the noise; the calibration is then unchanged.
+    The estimator calibrates copies of the model. The model that was passed is not changed. Each step of the calibration
+    adds to the earlier ones, but if `adapt` or `label` is called again, the new presses replace those of the call
+    before, so that the user can repeat bad presses. `undo` reverts the last step. Each step returns a text for the
+    user. It raises SchemaError if its data cannot be used, such as presses within the noise; the calibration is then
+    unchanged.
     """
 
     name = "universal model"
@@ -138,40 +113,35 @@ class UniversalEstimator:
     def __init__(self, model: Universal) -> None:
         self.channels_n, self.board = model.channels_n, model.layout
         self._noload_uT: Float[np.ndarray, " ch"] | None = None  # until it is set, the model keeps its own
-        # The last state is the current one. The earlier states are stored so that `undo` can return to them.
-        self._states = [LearningState.start(model)]
-        self._use(self.learnt)
-
-    @property
-    def learnt(self) -> LearningState:
-        """The current calibration data of the model."""
-        return self._states[-1]
-
-    @property
-    def undoable(self) -> bool:
-        """Whether there is a calibration step that `undo` can revert."""
-        return len(self._states) > 1
+        self._steps = [Step("", "", copy(model), {"in the file": model.presses_n})]
+        self._prepare()
 
     @property
     def model(self) -> Universal:
         """The calibrated model."""
-        return self._model
+        return self._steps[-1].model
+
+    @property
+    def undoable(self) -> bool:
+        """Whether there is a calibration step that `undo` can revert."""
+        return len(self._steps) > 1
 
     def set_noload(self, noload_uT: Float[np.ndarray, " ch"]) -> None:
-        """Set the no-load field, and repeat the calibration with it."""
+        """Set the no-load field, and keep the calibration."""
         self._noload_uT = noload_uT
-        self._use(self.learnt)
+        for step in self._steps:
+            step.model.zero(noload_uT, keep=True)
+        self._prepare()
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
         """Calibrate to the field changes of presses at unknown places."""
-        check_presses(db_uT)
-        before = self._estimate(db_uT)
-        step = f"calibration to {len(db_uT)} presses"
-        self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=step))
-        after = self._estimate(db_uT)
-        sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
+        n, before = len(db_uT), self._estimate(db_uT)
+        base = self._last_without("anywhere")
+        model = copy(base.model).see(db_uT, changes=True)
+        self._learn("anywhere", f"calibration to {n} presses", model, n, base)
+        sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, self._estimate(db_uT))]
         return (
-            f"adapted to {len(db_uT)} presses: median standard deviation of the places {sd_mm[0]:.2f} mm before, "
+            f"adapted to {n} presses: median standard deviation of the places {sd_mm[0]:.2f} mm before, "
             f"{sd_mm[1]:.2f} mm after"
         )
 
@@ -182,28 +152,25 @@ class UniversalEstimator:
 
         The forces of the presses were not measured.
         """
-        check_presses(db_uT[~held_out])
 
         def error_mm() -> float:
             estimated_mm = self._estimate(db_uT[held_out]).place_mm
             return float(np.median(np.linalg.norm(estimated_mm - place_mm[held_out], axis=1)))
 
-        before_mm, kept_n = error_mm(), int((~held_out).sum())
-        guided = Labels(place_mm[~held_out], np.full(kept_n, np.nan), db_uT[~held_out].astype(np.float64))
-        self._learn(self.learnt._replace(guided=guided, step=f"calibration to {kept_n} presses at known places"))
+        before_mm, n, base = error_mm(), int((~held_out).sum()), self._last_without("at crosses")
+        model = copy(base.model).label(place_mm[~held_out], None, db_uT[~held_out], keep=True, changes=True)
+        self._learn("at crosses", f"calibration to {n} presses at known places", model, n, base)
         return (
-            f"adapted to {kept_n} known places: median error at {held_out.sum()} other places "
+            f"adapted to {n} known places: median error at {held_out.sum()} other places "
             f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
         )
 
     def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
         """Calibrate to one more press, whose place and force are known; the force is NaN if it is unknown."""
-        check_presses(db_uT[None])
         before = self._estimate(db_uT[None])
-        one = Labels(np.array([place_mm], float), np.array([force_N]), db_uT[None].astype(np.float64))
-        typed = self.learnt.typed.followed_by(one)
-        self._learn(self.learnt._replace(typed=typed, step="calibration to the last labelled press"))
-        error_mm = float(np.linalg.norm(before.place_mm[0] - one.place_mm[0]))
+        model = copy(self.model).label([place_mm], [force_N], db_uT[None], keep=True, changes=True)
+        self._learn("with a label that you entered", "calibration to the last labelled press", model, 1)
+        error_mm = float(np.linalg.norm(before.place_mm[0] - place_mm))
         forces = "" if np.isnan(force_N) else f", force {before.force_N[0]:.2f} N instead of {force_N:.2f} N"
         return f"calibrated to a labelled press; before, the error of its place was {error_mm:.2f} mm{forces}"
 
@@ -217,7 +184,7 @@ class UniversalEstimator:
         off_mm = float(np.linalg.norm(estimate.place_mm[0] - place_mm))
         if off_mm <= max(LABEL_OFF_MM, LABEL_OFF_SDS * sd_mm):
             return ""
-        earlier = f" with {self._model.labels_n} earlier labels" if self._model.labels_n else ""
+        earlier = f" with {self.model.labels_n} earlier labels" if self.model.labels_n else ""
         return (
             f"the label is {off_mm:.1f} mm off the estimate{earlier}, x {x_mm:.1f}, y {y_mm:.1f} mm (standard "
             f"deviation {sd_mm:.1f} mm). Keep the label if it is right; otherwise discard it, and press again."
@@ -225,114 +192,95 @@ class UniversalEstimator:
 
     def refine(self) -> str:
         """Train the network further on the labelled presses (see `Universal.refine`)."""
-        refined = copy(self._model).refine()
-        data = refined.skin.data
-        self._learn(self.learnt._replace(refined=data.refined, step="refinement of the network"))
-        return f"refined the network on {len(data.labels)} labelled presses; button Undo reverts it"
+        self._learn("", "refinement of the network", copy(self.model).refine())
+        return f"refined the network on {self.model.labels_n} labelled presses; button Undo reverts it"
 
     def load(self, file: Path) -> str:
         """Replace all calibration data by a saved calibration."""
         if not file.is_file():  # for example, because another program deleted the file after the page had listed it
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
-        origin = copy(self.learnt.origin).remember(file)
-        self._learn(LearningState.start(origin, file.stem, f"loading of skin {file.stem}"))
-        return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
+        model = copy(self.model).remember(file)
+        saved = Step("", "", model, {}, skin=file.stem)
+        self._learn(f"in {file.stem}", f"loading of skin {file.stem}", model, model.presses_n, saved)
+        return f"loaded {file} (presses: {model.presses_n}, of which labelled: {model.labels_n})"
 
     def undo(self) -> str:
         """Revert the last calibration step."""
         if not self.undoable:
             return "nothing to undo: the model has not been calibrated on this page"
-        step = self._states.pop().step
-        self._use(self.learnt)
-        return f"undone: {step}"
+        what = self._steps.pop().what
+        self._prepare()
+        return f"undone: {what}"
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
-        estimate, misfit = self._estimate(db_uT), self._model.misfit(db_uT, changes=True)
+        estimate, misfit = self._estimate(db_uT), self.model.misfit(db_uT, changes=True)
         target = np.column_stack([estimate.place_mm, estimate.force_N])
         return Prediction(target, estimate.sd_mm, estimate.sd_N, np.asarray(misfit > MISFIT_MAX))
 
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
-        return self._model.estimate(db_uT, changes=True)
+        return self.model.estimate(db_uT, changes=True)
 
-    def _learn(self, state: LearningState) -> None:
-        """Calibrate the model with the data of a new state, and keep the previous state for `undo`.
+    def _last_without(self, kind: str) -> Step:
+        """Return the last step that is not of this kind."""
+        return next(step for step in reversed(self._steps) if step.kind != kind)
 
-        If the calibration fails, the previous state stays in use.
-        """
-        self._use(state)
-        self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
-
-    def _use(self, state: LearningState) -> None:
-        model = copy(state.origin)
+    def _learn(self, kind: str, what: str, model: Universal, presses_n: int = 0, base: Step | None = None) -> None:
+        """Use a model that was calibrated to more presses than that of step `base`, by default the last step."""
+        base = base or self._steps[-1]
         if self._noload_uT is not None:
             model.zero(self._noload_uT, keep=True)
-        if len(state.presses_uT):
-            model.see(state.presses_uT, changes=True)
-        if len(state.labels.force_N):
-            model.label(*state.labels, keep=True, changes=True)
-        if state.refined:
-            model.use_refined(state.refined)
+        counts = Counter(base.presses_n) + Counter({kind: presses_n})
+        self._steps = [*self._steps, Step(kind, what, model, counts, base.skin)][-UNDO_MAX_N - 1 :]
+        self._prepare()
+
+    def _prepare(self) -> None:
         # The first estimate of a model is slow, so it is made before the first contact.
-        model.estimate(np.zeros(self.channels_n), changes=True)
-        self._model, self.warnings = model, model.warnings
+        self.model.estimate(np.zeros(self.channels_n), changes=True)
+        self.warnings = self.model.warnings
 
     def describe(self, model_name: str) -> dict[str, str | bool]:
         """Return texts for the page: the model, what it has learnt, and what accuracy was measured for it.
 
         `model_name` contains the name of the model's file. It is empty for the model that is shipped with reskin.
         """
-        state, model = self.learnt, self.model
+        step, model = self._steps[-1], self.model
         name = f"universal model, {f'file {model_name}' if model_name else 'shipped with reskin'}"
-        counts = {
-            f"in {state.origin_name or 'the file'}": state.origin.presses_n,
-            "anywhere": len(state.presses_uT),
-            "at crosses": len(state.guided.db_uT),
-            "with a label that you entered": len(state.typed.db_uT),
-        }
-        learnt = ", ".join(
-            f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count
-        )
+        learnt = ", ".join(f"{n} press{'es' if n > 1 else ''} {kind}" for kind, n in step.presses_n.items() if n)
         return {
-            "model": name + (f", with the saved skin {state.origin_name}" if state.origin_name else ""),
-            "learnt": f"{learnt}; network refined" if state.refined else learnt,
-            "undoable": self.undoable, "refinable": model.refinable,
-            "expected": _expected_accuracy(model), "least_force": _least_force(model),
+            "model": name + (f", with the saved skin {step.skin}" if step.skin else ""),
+            "learnt": f"{learnt}; network refined" if model.skin.data.refined else learnt,
+            "undoable": self.undoable, "refinable": model.refinable, **_measured_texts(model),
         }  # fmt: skip
 
 
-def _expected_accuracy(model: Universal) -> str:
+def _measured_texts(model: Universal) -> dict[str, str]:
     """Describe the accuracy that was measured with as many presses and labels as this model knows, or with fewer."""
-    measured = _measured_of(model)
-    if measured is None:
-        return f"{NOT_MEASURED} for this model"
-    if model.skin.data.refined:
-        return f"{NOT_MEASURED} for a refined network"
+    (card, measured), least_N = _shipped(), model.layout.force_N[0]
+    trained = f"trained with simulated forces from {least_N:.2g} N"
+    if measured is None or model.card != card:
+        return {"expected": f"{NOT_MEASURED} for this model", "least_force": f"{NOT_MEASURED}; {trained}"}
+    found = measured["detection"]
+    least_force = (
+        f"{_join(found['detected_pct'], '.0f')} % of the lightest recorded presses "
+        f"({_join(found['lightest_N'], '.2g')} N) were detected; lighter presses {NOT_MEASURED}; {trained}"
+    )
     presses_n = model.presses_n - model.labels_n
     fitting = [
         each for each in measured["places"] if each["presses_n"] <= presses_n and each["labels_n"] <= model.labels_n
     ]
-    if not fitting:
-        return f"{NOT_MEASURED} for so few presses"
-    best = fitting[-1]
-    when = "before calibration"
-    if best["presses_n"]:
+    if model.skin.data.refined:
+        expected = f"{NOT_MEASURED} for a refined network"
+    elif not fitting:
+        expected = f"{NOT_MEASURED} for so few presses"
+    else:
+        best = fitting[-1]
         when = f"after {best['presses_n']} presses and {best['labels_n']} labels"
-    accuracy, error = _join(best["accuracy_pct"], ".0f"), _join(best["median_mm"], ".1f")
-    boards = f"{len(best['accuracy_pct'])} {measured['source']} boards of scene {measured['scene']}"
-    text = f"median error {error} mm, {accuracy} % within 1 mm ({boards}, {when})"
-    return text if not model.external_uT else f"{text}; {NOT_MEASURED} with external fields"
-
-
-def _least_force(model: Universal) -> str:
-    measured, least_N = _measured_of(model), model.layout.force_N[0]
-    trained = f"trained with simulated forces from {least_N:.2g} N"
-    if measured is None:
-        return f"{NOT_MEASURED}; {trained}"
-    found = measured["detection"]
-    return (
-        f"{_join(found['detected_pct'], '.0f')} % of the lightest recorded presses "
-        f"({_join(found['lightest_N'], '.2g')} N) were detected; lighter presses {NOT_MEASURED}; {trained}"
-    )
+        accuracy, error = _join(best["accuracy_pct"], ".0f"), _join(best["median_mm"], ".1f")
+        boards = f"{len(best['accuracy_pct'])} {measured['source']} boards of scene {measured['scene']}"
+        expected = f"median error {error} mm, {accuracy} % within 1 mm ({boards}, "
+        expected += f"{when if best['presses_n'] else 'before calibration'})"
+        expected += f"; {NOT_MEASURED} with external fields" if model.external_uT else ""
+    return {"expected": expected, "least_force": least_force}
 
 
 def _join(values: Sequence[float], digits: str) -> str:
@@ -348,11 +296,6 @@ def _shipped() -> tuple[dict[str, Any], dict[str, Any] | None]:
     """
     measured = io.read_json(MEASURED_FILE)
     return io.read_json(FILE.with_suffix(".json")), measured if measured["model_sha256"] == io.sha256(FILE) else None
-
-
-def _measured_of(model: Universal) -> dict[str, Any] | None:
-    card, measured = _shipped()
-    return measured if model.card == card else None
 
 
 class SkinFolder:

@@ -153,7 +153,10 @@ def test_presses_within_the_noise_are_refused(random_pokes):
     estimator = UniversalEstimator(load_universal())
     estimator.set_noload(noload_uT.mean(axis=0))
     before = estimator(db_uT.astype(np.float32)).target
-    for calibrate in (estimator.adapt, lambda weak_uT: estimator.label(b_uT[:, :2], weak_uT, np.arange(len(b_uT)) < 3)):
+    for calibrate in (
+        estimator.adapt,
+        lambda weak_uT: estimator.label(random_pokes[2], weak_uT, np.arange(len(b_uT)) < 3),
+    ):
         with pytest.raises(SchemaError, match="field changes must be 5 uT or more at one chip at least"):
             calibrate(1e-3 * db_uT)
     estimator.set_noload(noload_uT.mean(axis=0))

@@ -14,7 +14,7 @@ from reskin.board import find
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live import models
 from reskin.live.emulator import encode_pieces
-from reskin.live.models import MEASURED_FILE, Labels, NetworkEstimator, SkinFolder, UniversalEstimator
+from reskin.live.models import MEASURED_FILE, NetworkEstimator, SkinFolder, UniversalEstimator
 from reskin.live.presses import PRESSES_N, GuidedPresses, LabelledPress, PageRecording
 from reskin.live.server import receive
 from reskin.live.session import Session
@@ -174,7 +174,7 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
             estimator.add_label(wrong_mm, wrong_N, db_uT[3])
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, found)
     assert estimator.undo() == "undone: calibration to the last labelled press"
-    assert len(estimator.learnt.labels.force_N) == 2
+    assert estimator.model.labels_n == 2
 
 
 def test_label_far_off_the_estimate_is_used_only_if_the_user_keeps_it(random_pokes):  # noqa: F811
@@ -200,13 +200,13 @@ def test_label_far_off_the_estimate_is_used_only_if_the_user_keeps_it(random_pok
         state = labelled(wrong(right[1]))
         assert state["doubtful"]
         assert state["labelled"] in state["alarms"]
-        assert len(session.skin.estimator.learnt.typed.force_N) == 1
+        assert session.skin.estimator.model.labels_n == 1
         receive(session, '{"press": "discard"}')
         assert not session.state()["doubtful"]
         assert not labelled(right[2])["doubtful"]
         assert labelled(wrong(right[3]))["doubtful"]
         assert "calibrated to a labelled press" in text_after(session, {"press": "keep"}, "labelled")
-        assert len(session.skin.estimator.learnt.typed.force_N) == 3
+        assert session.skin.estimator.model.labels_n == 3
     finally:
         session.stop()
 
@@ -223,7 +223,7 @@ def test_many_requests_for_changes_are_refused_and_estimates_continue(random_pok
         assert "try again" in session.state()["adapted"]
         reader.resume()
         until(lambda: reader.at_end, session)
-        assert len(session.skin.estimator._states) < 50
+        assert len(session.skin.estimator._steps) < 50
     finally:
         session.stop()
 
@@ -250,9 +250,9 @@ def test_refinement_needs_enough_labels_and_can_be_undone(random_pokes, monkeypa
     with pytest.raises(SchemaError, match="at least 20 labels with known forces; got 0"):
         estimator.refine()
     assert not estimator.describe("")["refinable"]
-    pairs = (place_mm, place_mm), (force_N, force_N), (db_uT, db_uT + 1.0)
-    typed = Labels(*(np.concatenate(pair) for pair in pairs))
-    estimator._learn(estimator.learnt._replace(typed=typed, step="labels"))
+    pairs = (place_mm, place_mm), (force_N, force_N), (b_uT, b_uT + 1.0)
+    estimator = UniversalEstimator(load_universal().zero(noload_uT).label(*(np.concatenate(pair) for pair in pairs)))
+    estimator.set_noload(noload_uT.mean(axis=0))
     assert estimator.describe("")["refinable"]
     before = estimator(db_uT.astype(np.float32)).target
     weights = {name: value * np.float32(1.01) for name, value in estimator.model.weights.items()}
