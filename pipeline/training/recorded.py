@@ -1,15 +1,9 @@
-"""The recorded boards of a scene: how they are oriented (section `compare` of the scene), and their presses."""
+"""How the recorded boards of a scene are oriented (section `compare` of the scene)."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.fitting.axes import BoardAxes
-from pipeline.fitting.law_fit import AlignedPresses
-from pipeline.fitting.presses import pool_skins
 from pipeline.settings import Row, SectionWithRows, Settings
-from reskin import io
-from reskin.data.rows import Rows, Selection, load_rows
 from reskin.errors import ParamsError
 from reskin.universal.layout import BoardLayout, read_layout
 
@@ -41,30 +35,3 @@ class Compare(SectionWithRows):
         return BoardAxes(
             layout.setup(), layout.turns_deg, layout.centre_mm, self.labels_mirrored, f"layout {layout.name}"
         )
-
-
-@dataclass(frozen=True)
-class RecordedBoards:
-    """The recorded boards of a scene.
-
-    - rows: all readings with a known place, in the coordinates of the labels and along the chips' axes.
-    - axes: the conversion to the axes of the board.
-    - presses: means over the readings of each press with a known place and force, in the axes of the board. The keys
-        are names of boards, or `board/skin` for boards with several skins.
-    """
-
-    rows: Rows
-    axes: BoardAxes
-    presses: Mapping[str, AlignedPresses]
-
-
-def read_boards(settings: Settings, indentations: Path) -> RecordedBoards:
-    """Read the recorded boards of a scene; raise ParamsError unless there are two or more with known forces."""
-    files = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
-    axes = settings.section(Compare, "compare").axes
-    skins = pool_skins([io.read_readings(file) for file in files])
-    if len(skins) < 2:
-        where, what = f"scene {settings.scene}", "boards with known forces"
-        raise ParamsError(where, what, "two or more", len(skins), "Add recordings of another board.")
-    presses = {board: axes.align(pooled) for board, pooled in skins.items()}
-    return RecordedBoards(load_rows(files, settings.section(Selection, "selection")), axes, presses)
