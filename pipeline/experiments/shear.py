@@ -16,7 +16,7 @@ from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import over_units, tally
-from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs, write_timings
+from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.data.splits import NO_POOL, Fold, draw_sides
 from reskin.metrics import score_shear
@@ -44,7 +44,6 @@ def shear(settings: Settings, section: Shear, indentations: Path, scores: Path, 
     data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])
     jobs = make_jobs(data, section.training, data.folds)
     trained = train_jobs(data, jobs, "shear")
-    write_timings(settings.scene, "shear", jobs, trained)
     lines = {fold.name for fold in by_line}
     rows_of_jobs = [
         {"experiment": "shear", "split": BY_LINE if job.fold in lines else BY_READING, "recipe": job.recipe_name}

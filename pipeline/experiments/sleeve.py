@@ -20,7 +20,7 @@ from pipeline.scores import make_table, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic, tally
-from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
+from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, TRUTH, score
@@ -73,7 +73,6 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, scores: Path
         for seed_i in range(section.training.seeds_n)
     ]
     trained = train_jobs(data, jobs, "sleeve")
-    write_timings(settings.scene, "sleeve", jobs, trained)
     predictions = {
         name: [result.predicted for job, result in zip(jobs, trained, strict=True) if job.recipe_name == name]
         for name in section.training.recipes

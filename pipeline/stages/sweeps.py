@@ -19,7 +19,6 @@ from pipeline.training.jobs import (
     read_pretrained,
     score_test,
     train_jobs,
-    write_timings,
 )
 from reskin import io
 from reskin.config import Strict
@@ -73,7 +72,6 @@ def sweep_pokes(
     scored += _before_adaptation(pretrained, recipe.base, {fold.name for fold in held_out})
     write_scores(scores, rows_of_networks(scored))
     write_results(results, {}, {}, trainings=tally(map(collapse_record, trained)))
-    write_timings(settings.scene, "sweep_pokes", jobs, trained)
 
 
 def _before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -129,4 +127,3 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
     ]
     write_scores(scores, rows_of_networks(scored))
     write_results(results, {}, {}, trainings=tally(map(collapse_record, trained)))
-    write_timings(settings.scene, "sweep_sensors", jobs, trained)

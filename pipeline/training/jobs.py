@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, Protocol, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ from jaxtyping import Float32, Int64
 
 from pipeline.catalogue import module_name
 from pipeline.executors import make_executor, prepare_workers
-from pipeline.provenance import COSTS, SECONDS, code_version_of, home, record_trainings
+from pipeline.provenance import COSTS, code_version_of, home, record_trainings
 from pipeline.settings import Settings, Training
 from pipeline.stage import say
 from reskin import io
@@ -100,20 +100,6 @@ class ModelCard(TypedDict):
     tuning: NotRequired[dict[str, Any]]
     scores: NotRequired[dict[str, Any]]
     git: NotRequired[str]
-
-
-class _HasName(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-class _HasTimes(Protocol):
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def started_s(self) -> float: ...
-    @property
-    def one_reading_s(self) -> float: ...
 
 
 def preload_training() -> None:
@@ -253,10 +239,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> list[ModelCard]:
-    """Write models, cards and predictions to folder `models`; return the cards.
-
-    Times are written to a file that is not an output of the stage.
-    """
+    """Write models, cards and predictions to folder `models`; return the cards."""
     code = code_of(stage)
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
@@ -265,7 +248,6 @@ def write_models(
             tensors = dict(result.weights) | result.scaler.arrays()
             io.write_model(folder / f"{job.name}.safetensors", tensors, card | {"git": code})
         io.write_table(folder / "predictions.parquet", _predictions(jobs, results, data.rows))
-    write_timings(data.scene, stage, jobs, results)
     return cards
 
 
@@ -350,20 +332,6 @@ def network_keys(data: SceneData, job: TrainingJob, method: str) -> dict[str, An
 def collapse_record(result: TrainingResult) -> dict[str, Any]:
     """Return whether the training run collapsed, and how many earlier attempts with other random draws collapsed."""
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
-
-
-def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
-    """Write start, duration and prediction time of each training run to a file that is not an output of the stage."""
-    seconds = [
-        {
-            "name": job.name,
-            "started_s": result.started_s,
-            "train_s": result.seconds,
-            "one_reading_s": result.one_reading_s,
-        }
-        for job, result in zip(jobs, results, strict=True)
-    ]
-    io.write_json(SECONDS / scene / f"{stage}.json", seconds)
 
 
 def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:

@@ -22,7 +22,6 @@ from pipeline.training.jobs import (
     collapse_record,
     select_pretrained,
     train_jobs,
-    write_timings,
 )
 from reskin.data.splits import Fold
 from reskin.metrics import METRICS, score
@@ -78,7 +77,6 @@ def adapt_and_predict(
     """
     adapted = [job for _, job in jobs]
     trained = train_jobs(data, adapted, stage)
-    write_timings(data.scene, stage, adapted, trained)
     predictions = []
     for (variant, job), result in zip(jobs, trained, strict=True):
         board, true = str(data.rows.board[job.test[0]]), data.rows.target[job.test]
