@@ -19,14 +19,6 @@ from reskin.recordings.fault_policy import FaultPolicy
 MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
 # The rows of table 2, each with the experiment that provides its scores.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
-# Experiments and sections that no longer exist, by the experiment that replaces them.
-REPLACED = {
-    "new_board": ("labels", "few_labels", "calibrated", "random_presses", "reference_methods", "recorded_limits"),
-    "rig": ("universal",),
-    "interference": ("ambient", "moving_hand"),
-    "extremes": ("verification", "stability"),
-    "accuracy_and_cost": ("runtime", "neglected_effects"),
-}
 SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experiment.settings}
 Source = Literal["simulated", "recorded"]
 
@@ -182,11 +174,6 @@ def check_scene(settings: Settings) -> Scene:
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
     """Check a scene's experiments, and that the scene has the sections that they need, which are not parsed."""
-    named = content.get("experiments")
-    for new, olds in REPLACED.items():
-        if old := [name for name in olds if name in content or (isinstance(named, list) and name in named)]:
-            remedy = f"Use {new}; the scene that `reskin new` writes, or pipeline/scenes/ci.yaml, shows its settings."
-            raise ParamsError(f"{where}: {', '.join(old)} was replaced by {new}. {remedy}")
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))
