@@ -61,7 +61,6 @@ def analyse_levels(
         "sd_uT": np.round(along_uT.std(axis=(0, 2), ddof=1), 2).tolist(),
     }
     plot_data["by_direction"] = {name: np.round(share, 4).tolist() for name, share in by_direction.items()}
-    plot_data["told_by_length"] = {name: np.round(share, 4).tolist() for name, share in by_length.items()}
     return numbers, plot_data
 
 
