@@ -18,7 +18,7 @@ EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of DVC's temporary copies of a c
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
 NO_CODE = ("plan.yaml", "scenes")  # settings rather than code, although they are in package `pipeline`
 COSTS = Path(".reskin/costs")
-SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
+SECONDS = Path(".reskin/seconds")  # run times of numerical methods on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
 CPUINFO = Path("/proc/cpuinfo")  # exists only on Linux
 # Names of instruction sets, by the flag in /proc/cpuinfo.
