@@ -96,21 +96,10 @@ def agreement(presses: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"])
     } | ({} if None in grown.values() else {"growth": grown})
 
 
-def check_frames(presses: AlignedPresses, axes: BoardAxes) -> dict[str, Any]:
-    """Check the orientations of labels, chips and skin: a sentence, and the cosine of each chip as stated and at best.
-
-    The cosines are between recorded and simulated dB of the nominal skin, over all presses together.
-    """
-    frames = frames_of(presses, axes)
-    columns = zip(frames.chips.tolist(), frames.as_written.tolist(), frames.cosines.tolist(), frames.turns, strict=True)
-    chips = [
-        {
-            "chip": i, "at": position, "cosine_as_written": written, "cosine_best": best,
-            "read": turn.describe(axes.stated_by),
-        }
-        for i, (position, written, best, turn) in enumerate(columns)
-    ]  # fmt: skip
-    return {"sentence": describe_outside(presses.place_mm, axes) or frames.sentence(axes.stated_by), "chips": chips}
+def check_frames(presses: AlignedPresses, axes: BoardAxes) -> dict[str, str]:
+    """Describe in a sentence whether labels, chips and skin are oriented as stated."""
+    outside = describe_outside(presses.place_mm, axes)
+    return {"sentence": outside or frames_of(presses, axes).sentence(axes.stated_by)}
 
 
 def _outline(axes: BoardAxes) -> dict[str, Any]:

@@ -38,7 +38,6 @@ def test_orientation_is_checked_on_every_board(compared):
     assert set(numbers["by_board"]["b3"]) == {"frames", "pokes_n", "left_out_n"}  # its forces are unknown
     for found in numbers["by_board"].values():
         assert found["frames"]["sentence"] == "Labels, chips and skin are oriented as layout reskin states."
-        assert all(chip["cosine_best"] == chip["cosine_as_written"] > 0.5 for chip in found["frames"]["chips"])
 
 
 @pytest.fixture(scope="module")
