@@ -1,6 +1,6 @@
 """Communication with boards, from the port to frames without faults.
 
-- `port` opens a port and reads bytes; `reader` does so in a thread, and `find` detects which board is on which port.
+- `port` opens a port and reads bytes; `find` detects which board is on which port.
 - `wire` has the formats of the ReSkin and AnySkin firmware; to read other lines or binary frames, describe them as in
   `custom`. `stream` splits any bytes into frames, and accounts for every byte.
 - `chips` has the steps of magnetometers: add your chip there.

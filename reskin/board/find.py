@@ -14,13 +14,12 @@ from jaxtyping import Float64
 
 from reskin.board import faults, rates
 from reskin.board.custom import AnyWire, CustomWire
-from reskin.board.port import open_port, port_names, read_waiting
+from reskin.board.port import BAUD, Chunk, open_port, port_names, read_waiting
 from reskin.board.rates import RateMeasurement
 from reskin.board.stream import FrameStream, decode_all, describe_unknown, matching_formats
 from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import CONVERSION_S, GAINS, steps_uT
 
-BAUD = 115200  # USB ports ignore the baud rate
 # In this time, even the slowest board sends about 200 frames. This is enough to find the LSB of its chips.
 LISTENING_S = 1.5
 REPLUG_TIMEOUT_S = 60.0
@@ -28,7 +27,6 @@ POLL_S = 0.2
 BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
 # relative tolerance with which a measured LSB is compared with that of a gain; LSBs of two gains differ by 20 % or more
 LSB_TOLERANCE = 0.05
-Chunk = tuple[bytes, float]  # bytes that were read at once, and their time of arrival in s
 
 
 class DetectedBoard(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from reskin.board.find import DetectedBoard
-from reskin.board.reader import Reader
+from reskin.board.port import Reader
 from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates
 from reskin.recordings.header import Clock, Source, write_header

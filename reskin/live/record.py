@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from reskin.board.find import BAUD, DetectedBoard
-from reskin.board.port import check_name
+from reskin.board.find import DetectedBoard
+from reskin.board.port import BAUD, check_name
 from reskin.errors import ParamsError
 from reskin.live.health import Health
 from reskin.recordings.header import Source

@@ -26,9 +26,7 @@ from scipy.spatial.transform import Rotation
 from reskin.board import find
 from reskin.board.custom import CustomWire
 from reskin.board.faults import GARBAGE_FRAMES_N
-from reskin.board.find import Chunk
-from reskin.board.port import check_name
-from reskin.board.reader import PLUGGED_IN, Reader
+from reskin.board.port import BAUD, PLUGGED_IN, Chunk, Reader, check_name
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
@@ -161,7 +159,7 @@ class LiveSkin:
     """
 
     def __init__(
-        self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY,
+        self, port: str, models: Models = (), *, baud: int = BAUD, fault_policy: FaultPolicy = LIVE_POLICY,
         wire: CustomWire | None = None,
     ) -> None:  # fmt: skip
         self.port, self.fault_policy, self.wire = port, fault_policy, wire

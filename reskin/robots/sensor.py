@@ -15,6 +15,7 @@ from typing import Any
 import reskin
 from reskin.api import AnyModel
 from reskin.board import find
+from reskin.board.port import BAUD
 from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates, LiveSkin
 
@@ -43,7 +44,7 @@ class SkinSensorConfig:
 
     port: str
     model: AnyModel = ()
-    baud: int = find.BAUD
+    baud: int = BAUD
     without_contact: float = math.nan
 
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from reskin import cli
 from reskin.board import find
+from reskin.board.port import BAUD
 from reskin.board.rates import RateMeasurement, RateMeter, RepeatCounter, explain, find_limits, measure
 from reskin.board.stream import decode_all
 from reskin.seeds import rng_for
@@ -145,7 +146,7 @@ def test_rate_limits_are_lower_for_more_chips_longer_frames_or_slower_conversion
 def test_rate_of_an_emulated_board_is_explained_by_its_limit_or_fault(script, sentence):
     """In fault `torn`, each frame that is cut is lost together with the next frame, so two of ten frames are lost."""
     board = recognise_at_due_times(script)
-    assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=find.BAUD)))
+    assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=BAUD)))
 
 
 def test_explanation_depends_on_the_settings_of_the_chips():

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from reskin import cli as commands
 from reskin.board import find
+from reskin.board.port import BAUD, open_port
 from reskin.errors import CaptureError, ReskinError
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
@@ -101,17 +102,17 @@ def test_file_given_as_a_port_is_an_error_of_one_sentence(tmp_path, monkeypatch,
 
 
 def test_busy_port_is_an_error_of_one_sentence():
-    with plugged_in(make_script(pokes_n=0), loop=True) as name, find.open_port(name, find.BAUD):
+    with plugged_in(make_script(pokes_n=0), loop=True) as name, open_port(name, BAUD):
         busy = f"{name}: cannot open the port: another program uses it"
         with pytest.raises(CaptureError, match=busy) as error:
-            find.open_port(name, find.BAUD)
+            open_port(name, BAUD)
         assert "\n" not in str(error.value)
         assert str(find.detect_board(name, 0.1)).startswith(busy)
 
 
 def test_opening_a_device_that_is_not_a_serial_port_raises():
     with pytest.raises(CaptureError, match=f"{os.devnull}: cannot open the port: it is not a serial port"):
-        find.open_port(os.devnull, find.BAUD)
+        open_port(os.devnull, BAUD)
 
 
 def test_find_board_raises_unless_exactly_one_board_is_connected(monkeypatch):
