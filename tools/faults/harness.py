@@ -182,7 +182,8 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 
 def message_of(output: Sequence[str] | str) -> str:
     """Return the error message in a command's output: the message of the stage if there is one, else that of DVC."""
-    lines = output.splitlines() if isinstance(output, str) else list(output)
+    # An error follows a progress bar without a new line.
+    lines = re.sub(r"\d+%\|.*?\]", "\n", output).splitlines() if isinstance(output, str) else list(output)
     # DVC reports its own damaged files with the words "is invalid".
     for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):
         found = [line for line in lines if line.startswith(start) or f" {start} " in f" {line}"]

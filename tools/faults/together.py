@@ -12,7 +12,7 @@ from tests.recordings.readers.test_lab import PRESSES, write
 from tests.repositories import git
 from tests.scenes import recorded_scene
 from tools.faults.files import _truncate
-from tools.faults.harness import Checkout, Result, Row, fault, judge
+from tools.faults.harness import SCENE, Checkout, Result, Row, fault, judge
 from tools.faults.kills import address
 
 TRIPLET = address("train_triplet")
@@ -69,8 +69,10 @@ def _add(checkout: Checkout) -> list[str]:
     return ["python", "-m", "pipeline", "add", str(recording / "readings.csv"), *labels]
 
 
-def _ingest(checkout: Checkout) -> Result:
-    return checkout.run("dvc", "repro", INGEST)
+def _ingest(checkout: Checkout, *others: str) -> Result:
+    """Put the scene of the added recording into the plan; then run its stage, and other stages."""
+    checkout.run("python", "-m", "pipeline", "scenes", "use", SCENE, "rig")
+    return checkout.run("dvc", "repro", INGEST, *others)
 
 
 @fault(
@@ -85,7 +87,7 @@ def add_beside(checkout: Checkout) -> Row:
     added = other.run(*command)
     one = checkout.end(first, start_s)
     later = checkout.run(*command)
-    row = judge(checkout, added, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row = judge(checkout, added, _ingest(checkout, *FINISHED), may_run=[INGEST])
     row.faults += [] if (one.status, later.status) == (0, 0) else ["`dvc repro` or the later `reskin add` fails"]
     row.next_run = f"the recording is added after the end of `dvc repro`; {row.next_run}"
     return row
@@ -107,7 +109,7 @@ def kill_add(checkout: Checkout) -> Row:
     again = checkout.run(*command)
     shutil.rmtree(checkout.folder / RAW)
     later = checkout.run(*command)
-    row = judge(checkout, again, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row = judge(checkout, again, _ingest(checkout, *FINISHED), may_run=[INGEST])
     row.faults += (
         []
         if (after_kill.status, after_kill.ran, later.status) == (0, [], 0)
@@ -129,7 +131,7 @@ def kill_ingest(checkout: Checkout) -> Row:
     repro = checkout.start("dvc", "repro", INGEST)
     checkout.stage("ingest").kill()
     result = checkout.end(repro, start_s)
-    row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row = judge(checkout, result, _ingest(checkout, *FINISHED), may_run=[INGEST])
     row.faults += (
         []
         if (undisturbed.status, checkout.lock()[INGEST]) == (0, expected)
@@ -153,7 +155,7 @@ def cut_recording(checkout: Checkout) -> Row:
     result = _ingest(checkout)
     git(checkout.folder, "restore", f"{RAW}.dvc")
     restored = checkout.run("dvc", "checkout", "--force", f"{RAW}.dvc")
-    row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row = judge(checkout, result, _ingest(checkout, *FINISHED), may_run=[INGEST])
     row.faults += (
         []
         if restored.status == 0 and checkout.lock()[INGEST] == expected
