@@ -190,15 +190,10 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
 
     A single mark determines only the offset; the rate is then assumed to be 1. Several marks also determine the rate.
     """
-    given = marks.tolist()
-    if not given or not np.isfinite(marks).all():
-        raise CaptureError(
-            where, "clock.marks", "one or more pairs of finite times", given, "Correct the marks in header.json."
-        )
     if len(np.unique(marks[:, 0])) < len(marks):
         raise CaptureError(
-            f"{where}: two marks in clock.marks have the same stream time: {given}. Remove one of these marks from "
-            "header.json."
+            f"{where}: two marks in clock.marks have the same stream time: {marks.tolist()}. Remove one of these marks "
+            "from header.json."
         )
     return _line(marks[:, 0], marks[:, 1] - marks[:, 0], 1.0, where)
 

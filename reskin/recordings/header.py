@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from reskin import io
 from reskin.board.custom import AnyWire
+from reskin.config import Strict
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout
 
@@ -33,11 +34,7 @@ Source = Literal["simulated", "recorded"]
 Layout = Literal["native", ReaderLayout, "sd-card"]
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class Clock(_Frozen):
+class Clock(Strict):
     """The source of the times of frames.
 
     `kind` is `arrivals` if the times are in the file arrivals.csv, `rate` if they are computed from the constant frame
@@ -57,7 +54,7 @@ class Clock(_Frozen):
         return self
 
 
-class Firmware(_Frozen):
+class Firmware(Strict):
     """The gain of the magnetometers, as set by the firmware, and the resulting LSB (MLX90393 data sheet, table 17)."""
 
     gain_sel: Annotated[int, Field(ge=0, le=7)]
@@ -65,7 +62,7 @@ class Firmware(_Frozen):
     lsb_z_uT: Annotated[float, Field(gt=0)]
 
 
-class Rate(_Frozen):
+class Rate(Strict):
     """The frame rate and the fraction of repeated readings, as the recorder measured them.
 
     `sent_hz` is the rate according to the board's clock if `method` is `clock`. If `method` is `arrivals`, the board
@@ -79,7 +76,7 @@ class Rate(_Frozen):
     repeated_readings: Annotated[float, Field(ge=0, le=1)]
 
 
-class Header(_Frozen):
+class Header(Strict):
     """The header of a capture. All fields except `rate` must be present in the file.
 
     A capture has no `rate` if it was recorded by another program, or by a version of this program that did not measure

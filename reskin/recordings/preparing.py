@@ -27,7 +27,7 @@ from reskin.recordings.fault_policy import REFUSE_NONE
 from reskin.recordings.header import Clock, Header
 from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS, table
-from reskin.recordings.tables import NUMBER_PATTERN, count_chips_of
+from reskin.recordings.tables import count_chips_of, is_number
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
 UNNAMED = "unnamed"  # name of the board and of the skin in a recording that was made without names
@@ -57,7 +57,7 @@ def parse_marks(texts: list[str]) -> Marks:
     marks = []
     for text in texts:
         stream_s, comma, probe_s = text.partition(",")
-        if not comma or not all(re.match(NUMBER_PATTERN, number, re.ASCII) for number in (stream_s, probe_s)):
+        if not comma or not (is_number(stream_s) and is_number(probe_s)):
             raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(text), "Example: --mark 0,12.5")
         marks.append((float(stream_s), float(probe_s)))
     return tuple(marks)

@@ -154,7 +154,7 @@ def test_folder_left_by_a_killed_add_is_reported(root, lab_file):
     assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed before")
 
 
-@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1", "1.2.3,1", "1_0,2", "\u0663,2"])
+@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1", "1e999,1", "1.2.3,1", "1_0,2", "\u0663,2"])
 def test_invalid_mark_is_an_error(text):
     with pytest.raises(ReskinError, match="--mark: a mark must be STREAM_S,PROBE_S"):
         preparing.parse_marks([text])

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -66,6 +67,10 @@ def test_longer_names_and_names_with_other_characters_are_invalid(name):
         ({"colour": "red"}, "colour: Extra inputs are not permitted; got 'red'"),
         ({"wire": "binary"}, "wire must be given for layout 'native', and only for it"),
         ({"clock": {"kind": "rate", "rate_hz": None, "marks": []}}, "rate_hz must be given for clock kind 'rate'"),
+        (
+            {"clock": {"kind": "recording", "rate_hz": None, "marks": [[0.0, np.nan]]}},
+            "clock.marks.0.1: Input should be a finite number",
+        ),
     ],
 )
 def test_error_names_the_invalid_field(changed, message):
