@@ -189,11 +189,6 @@ def reset_chips(
     return after_reset | _differs(lsb_uT, (usual_xy_uT, usual_z_uT))
 
 
-def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of stuck chips in a whole recording; see `StuckChips`."""
-    return StuckChips(b_uT.shape[1] // 3).feed(b_uT)
-
-
 class StuckChips:
     """A detector of stuck chips in a recording, which may be passed in several parts of any length.
 

@@ -4,6 +4,7 @@ Both work block by block, so that a dump may be longer than the memory.
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -36,18 +37,18 @@ def decode_file(dump: Path, out: Path, wire: AnyWire, chips_n: int) -> dict[str,
         for name, unit in frame_columns(chips_n).items()
     ]
     schema = pa.schema(fields)
-    with io.replacing(out) as temporary:
+    with io.replacing(out) as temporary, ExitStack() as opened:
         if out.suffix == ".csv":
-            with temporary.open("wb") as file:
-                file.write(",".join(schema.names).encode() + b"\n")
-                options = pacsv.WriteOptions(include_header=False, quoting_style="none")
-                with pacsv.CSVWriter(file, schema, write_options=options) as writer:
-                    for frames in decode_blocks(io.read_blocks(dump, BLOCK_BYTES_N), wire, chips_n, str(dump), account):
-                        writer.write_table(_table(frames, schema))
+            file = opened.enter_context(temporary.open("wb"))
+            file.write(",".join(schema.names).encode() + b"\n")
+            options = pacsv.WriteOptions(include_header=False, quoting_style="none")
+            writer = opened.enter_context(pacsv.CSVWriter(file, schema, write_options=options))
         else:
-            with pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as writer:
-                for frames in decode_blocks(io.read_blocks(dump, BLOCK_BYTES_N), wire, chips_n, str(dump), account):
-                    writer.write_table(_table(frames, schema))
+            writer = opened.enter_context(
+                pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
+            )
+        for frames in decode_blocks(io.read_blocks(dump, BLOCK_BYTES_N), wire, chips_n, str(dump), account):
+            writer.write_table(_table(frames, schema))
     return account
 
 

@@ -22,10 +22,10 @@ from reskin.board.faults import (
     FaultDetector,
     Faults,
     ReadingFaults,
+    StuckChips,
     find_lsb,
     find_reading_faults,
     reset_chips,
-    stuck_chips,
 )
 from reskin.board.wire import Frames, concatenate
 from reskin.config import Strict
@@ -66,7 +66,6 @@ class FaultPolicy(Strict):
     wrong_baud: DropOrRefuse  # very many stray bytes between two frames
 
 
-REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
 # A policy that never refuses a recording. It is used to test whether a recording can be read. For each fault, it has
 # the first of the possible actions, which is never "refuse".
 REFUSE_NONE = FaultPolicy.model_validate(
@@ -87,7 +86,7 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 
     `where` is the command-line option that contains these texts; error messages name it.
 
-    >>> override(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
+    >>> override(STANDARD_POLICY, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
     """
     changes: dict[str, Any] = {}
@@ -349,10 +348,11 @@ def check_rows(
             reset_chips(lsb_uT, expected_lsb_uT) | without_grid, np.where(without_grid[:, None], np.nan, lsb_uT),
             expected_lsb_uT, f"{where} from row {row[block[0]]}", USUAL_LSB, row[block],
         )  # fmt: skip
-    constant = ConstantChannels(temperature_degC.shape[1])
+    chips_n = temperature_degC.shape[1]
+    constant = ConstantChannels(chips_n)
     constant.feed(b_uT[read])
     log.record_constant(constant.describe(), row)
-    stuck = log.record("stuck", stuck_chips(b_uT).any(axis=1) & read, row) & ~failed
+    stuck = log.record("stuck", StuckChips(chips_n).feed(b_uT).any(axis=1) & read, row) & ~failed
     out_of_range &= ~stuck
     return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, log.account())
 

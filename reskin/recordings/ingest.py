@@ -78,22 +78,6 @@ class _DwellFrames:
         return _DwellFrames(*map(np.concatenate, pairs))
 
 
-def join(
-    blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
-) -> Iterator[Readings]:
-    """Assign the frames of a stream to dwells, and yield the readings of each indentation after it has ended.
-
-    After the last readings, the counts of frames and indentations are added to `account`.
-    """
-    joiner = Joiner(log, clock, header)
-    for block in blocks:
-        if len(readings := joiner.feed(block)):
-            yield readings
-    if len(readings := joiner.close()):
-        yield readings
-    account.update(joiner.account())
-
-
 class Joiner:
     """An object that assigns frames to dwells, and converts each indentation to readings once it has ended.
 
@@ -304,8 +288,17 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
         "clock_residual_us": round(1e6 * clock.residual_s),
         "clock_explained_pct": round(100 * clock.explained),
     }
-    blocks = _timed_frames(folder, header, times_of, account, policy)
-    return join(blocks, log, clock, header, account), account
+
+    def read() -> Iterator[Readings]:
+        joiner = Joiner(log, clock, header)
+        for block in _timed_frames(folder, header, times_of, account, policy):
+            if len(readings := joiner.feed(block)):
+                yield readings
+        if len(readings := joiner.close()):
+            yield readings
+        account.update(joiner.account())
+
+    return read(), account
 
 
 def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:

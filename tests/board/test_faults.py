@@ -121,6 +121,11 @@ class TestScale:
             np.testing.assert_allclose(faults.find_lsb(b_uT), [GRIDS_uT["lab"]] * 2, rtol=0.02)
 
 
+def stuck_chips(b_uT: np.ndarray) -> np.ndarray:
+    """Mark the readings of stuck chips in a whole recording."""
+    return faults.StuckChips(b_uT.shape[1] // 3).feed(b_uT)
+
+
 class TestStuck:
     def stuck_naively(self, b_uT: np.ndarray) -> np.ndarray:
         """Return the reference: for each reading, walk back over equal readings.
@@ -151,7 +156,7 @@ class TestStuck:
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)
-        np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.stuck_naively(b_uT))
+        np.testing.assert_array_equal(stuck_chips(b_uT), self.stuck_naively(b_uT))
 
     @given(st.lists(st.integers(0, 200), max_size=4))
     def test_stuck_chips_do_not_depend_on_the_chunks_that_are_fed(self, ends):
@@ -159,18 +164,18 @@ class TestStuck:
         b_uT[60:150, 3:6] = b_uT[60, 3:6]
         detector = faults.StuckChips(2)
         parts = [detector.feed(part) for part in np.split(b_uT, sorted(ends))]
-        np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
+        np.testing.assert_array_equal(np.concatenate(parts), stuck_chips(b_uT))
 
     def test_chip_counts_as_stuck_from_its_20th_equal_reading_on(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)
         expected[120 + faults.STUCK_FRAMES_MIN_N - 1 :, 1] = True
-        np.testing.assert_array_equal(faults.stuck_chips(b_uT), expected)
+        np.testing.assert_array_equal(stuck_chips(b_uT), expected)
 
     def test_board_on_which_no_chip_changes_does_not_count_as_stuck(self):
-        assert not faults.stuck_chips(np.ones((100, 15))).any()
+        assert not stuck_chips(np.ones((100, 15))).any()
 
     def test_no_fault_is_found_on_a_real_working_board(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")
-        assert not faults.stuck_chips(b_uT).any()
+        assert not stuck_chips(b_uT).any()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from reskin.board.wire import Frames
 from reskin.recordings.clocks import ClockMap
 from reskin.recordings.fault_policy import CheckedRows
-from reskin.recordings.ingest import Joiner, TimedFrames, join
+from reskin.recordings.ingest import Joiner, TimedFrames
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.schema import Readings
 from reskin.seeds import rng_for
@@ -75,13 +75,12 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
 
 def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Join all blocks of frames with the log. Return the readings as columns, and the account of frames."""
-    account: dict[str, int] = {}
-    parts = list(join(blocks, log, CLOCK, HEADER, account))
-    empty = Joiner(log, CLOCK, HEADER).close()
+    joiner = Joiner(log, CLOCK, HEADER)
+    parts = [*map(joiner.feed, blocks), joiner.close()]
     names = [
         field.name for field in dataclasses.fields(Readings) if field.name not in ("capture", "board", "skin", "source")
     ]
-    return {name: np.concatenate([getattr(part, name) for part in [empty, *parts]]) for name in names}, account
+    return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}, joiner.account()
 
 
 def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
