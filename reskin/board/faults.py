@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
+from reskin.board.chips import (
+    B_MAX_uT,
+    RESET_LSB_XY_uT,
+    RESET_LSB_Z_uT,
+    STEP_MIN_uT,
+    TEMPERATURE_MAX_degC,
+    TEMPERATURE_MIN_degC,
+)
 from reskin.board.wire import Frames
 
 # Values that the ReSkin firmware sends for a chip whose I2C read failed. They were found in AFG_flex_50, one of the
@@ -36,12 +43,8 @@ JUMP_WINDOW_N, JUMP_READINGS_MIN_N = 7, 20
 RANGE_END = 0.999  # fields beyond this fraction of 2^15 steps are at the end of the range
 RANGE_MARGIN = 1.05  # a field beyond 2^15 steps by this factor is impossible
 
-# The LSB of a chip is the step between neighbouring values that the chip can send. These are the LSBs of a chip with
-# its power-on settings, found in AFG_test_new_board15 and piezo, two public recordings of layout `ini`.
-RESET_LSB_XY_uT = 0.98
-RESET_LSB_Z_uT = 1.58
-# Two LSBs are treated as different if they differ by more than this fraction. The LSBs of different gains of the
-# MLX90393 differ by 20 % or more (data sheet, table 17).
+# The LSB of a chip is the step between neighbouring values that the chip can send. Two LSBs are treated as different if
+# they differ by more than this fraction. Those of two gains of the MLX90393 differ by 20 % or more (data sheet).
 LSB_TOLERANCE = 0.1
 
 # The values of a channel are multiples of the chip's LSB, so they lie on a grid whose step is the LSB. To find this
@@ -58,7 +61,6 @@ STEP_SPREAD_MAX = 0.06
 # A stricter choice than STEPS_MIN_N. This many equal gaps do not occur by chance, even if there are few distinct
 # values, as in data without noise.
 SURE_STEPS_MIN_N = 20
-STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
 # A gap below this value is a rounding error of float32 arithmetic, so the two values are treated as equal.
 SAME_VALUE_uT = 1e-3
 
@@ -71,7 +73,6 @@ STUCK_FRAMES_MIN_N = 20
 # only while the skin is pressed or released, and are constant in the other frames.
 OTHERS_MOVE_MIN = 0.5
 
-B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock counts as a jump
 MICROS_WRAP_S = 2**32 / 1e6  # Arduino's micros() counts to 2^32, and then again from 0

@@ -26,7 +26,7 @@ REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
 BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
 # relative tolerance with which a measured LSB is compared with that of a gain; LSBs of two gains differ by 20 % or more
-LSB_TOLERANCE = 0.05
+GAIN_TOLERANCE = 0.05
 
 
 class DetectedBoard(NamedTuple):
@@ -46,7 +46,7 @@ class DetectedBoard(NamedTuple):
         """Setting GAIN_SEL of the chips, derived from their LSB; None if no value of GAIN_SEL gives this LSB."""
         for gain_sel in range(len(GAINS)):
             xy_uT, _, z_uT = steps_uT(gain_sel)
-            if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
+            if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=GAIN_TOLERANCE):
                 return gain_sel
         return None
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 
 from reskin.board import wire as wires
+from reskin.board.chips import B_PLAUSIBLE_uT, TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from reskin.board.custom import AnyWire, CustomWire
 from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run, Wire
 from reskin.errors import CaptureError
@@ -25,12 +26,10 @@ CHIPS_MAX_N = 64  # the same limit as in the header of a capture
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
-# Limits of plausible values. An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. The limits are used
-# only if the bytes can be divided into frames in several ways, because CR LF occurs at several possible positions. A
-# frame with values outside the limits is not dropped, because the values that the firmware sends for a failed read are
-# outside too (see `faults`).
-TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
-B_MAX_uT = 6e4
+# The smallest plausible value; module `chips` has the other limits of plausible values. The limits are used only if the
+# bytes can be divided into frames in several ways, because CR LF occurs at several possible positions. A frame with
+# values outside the limits is not dropped, because the values that the firmware sends for a failed read are outside too
+# (see `faults`).
 VALUE_MIN = 1e-3  # in uT or degC; a value that is smaller but not 0 is implausible, because it is below the LSB
 
 HEAD_BYTES_N = 16384  # the format is found from this number of bytes
@@ -336,7 +335,7 @@ def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
     temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
     possible_temperature = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
     possible_value = (txyz == 0) | (np.abs(txyz) >= VALUE_MIN)
-    possible_value[..., 1:] &= np.abs(b_uT) <= B_MAX_uT
+    possible_value[..., 1:] &= np.abs(b_uT) <= B_PLAUSIBLE_uT
     return possible_temperature & possible_value.all(axis=-1)
 
 

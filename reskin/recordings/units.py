@@ -13,9 +13,6 @@ from reskin.errors import CaptureError
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.recordings.tables import FIRST_ROW
 
-# Largest field that an MLX90393 can send: 2^15 steps of its coarsest LSB, which is 9.680 uT along z with GAIN_SEL 0 and
-# RES 3 (data sheet, table 17).
-FULL_SCALE_uT = 32768 * 9.680
 # If the median field is below this number, the fields are not in uT but in a larger unit, such as mT or G. In uT, even
 # the earth's field is 25 to 65, and a chip under a skin reads 200 to 9000.
 WEAKEST_uT = 20.0
@@ -59,7 +56,7 @@ def check_fields(
     step_uT = _find_step(b_uT)
     if chips.is_step(step_uT):
         return
-    if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
+    if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < chips.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
         remedy = f"The unit is probably {unit}. Convert the fields to uT."
         raise CaptureError(where, "the step between values of the field", STEP_RULE, f"{step_uT:.3g}", remedy)
@@ -75,7 +72,7 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
     step_uT = _find_step(db_uT)
     if chips.is_step(step_uT):
         return
-    if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
+    if step_uT > NANO_STEP_MIN or step_uT < chips.STEP_MIN_uT:
         remedy = "The unit is probably nT, mT or G. Convert the field changes to uT."
         raise CaptureError(where, "the step between values of the field change", STEP_RULE, f"{step_uT:.3g}", remedy)
 
@@ -186,9 +183,9 @@ def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:
 
 def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, line_n: Int[np.ndarray, " f"]) -> None:
     b_max_uT = np.abs(b_uT).max(axis=1)
-    if b_max_uT.max() > FULL_SCALE_uT:
+    if b_max_uT.max() > chips.FULL_SCALE_uT:
         place = f"line {line_n[b_max_uT.argmax()]}"
-        rule = f"below the full scale of the chip, {FULL_SCALE_uT:.0f} uT"
+        rule = f"below the full scale of the chip, {chips.FULL_SCALE_uT:.0f} uT"
         got = f"{b_max_uT.max():.6g} in {place}"
         raise CaptureError(
             where, "field", rule, got, "Check that the columns have the right order, and that the unit is uT."
@@ -207,5 +204,5 @@ def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
         return np.nan
     step_uT = float(np.median(steps_uT))
     decimals = np.log10(step_uT)
-    rounded = step_uT < faults.STEP_MIN_uT and abs(decimals - round(decimals)) < 0.01
+    rounded = step_uT < chips.STEP_MIN_uT and abs(decimals - round(decimals)) < 0.01
     return np.nan if rounded else step_uT

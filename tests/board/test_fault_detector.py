@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from reskin import seeds
 from reskin.board import faults
+from reskin.board.chips import RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.faults import SCALE_FRAMES_N, FaultDetector
 from reskin.board.wire import Frames
 from reskin.errors import CaptureError
@@ -18,7 +19,7 @@ from tests.board.signals import frames_of
 from tests.recordings.headers import DEFAULT_POLICY
 
 CHIPS_N = 3
-RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
+RESET_uT = (RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT)
 
 
 def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 0.242), seed: int = 0) -> Frames:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin import seeds
-from reskin.board import faults
+from reskin.board import chips, faults
 
 NOISE_uT = 5.0  # The noise of real boards is 3.0 to 5.0 uT.
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
@@ -86,14 +86,14 @@ class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 4), st.integers(0, 1000))
     def test_chip_with_power_on_settings_is_found(self, name, chip_i, seed):
         grids_uT = [GRIDS_uT[name]] * 5
-        grids_uT[chip_i] = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
+        grids_uT[chip_i] = (chips.RESET_LSB_XY_uT, chips.RESET_LSB_Z_uT)
         b_uT = readings_on_grid(grids_uT, 400, seed)
         expected = [i == chip_i for i in range(5)]
         assert faults.reset_chips(faults.find_lsb(b_uT), None).tolist() == expected
         assert faults.reset_chips(faults.find_lsb(b_uT), GRIDS_uT[name]).tolist() == expected
 
     def test_step_at_power_on_is_accepted_if_it_is_expected(self):
-        grid_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
+        grid_uT = (chips.RESET_LSB_XY_uT, chips.RESET_LSB_Z_uT)
         b_uT = readings_on_grid([grid_uT] * 5, 400, 0)
         assert faults.reset_chips(faults.find_lsb(b_uT), None).all()
         assert not faults.reset_chips(faults.find_lsb(b_uT), grid_uT).any()

@@ -5,14 +5,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
-from reskin.board.faults import (
-    INT16_STEPS_N,
-    FAILED_B_uT,
-    FAILED_TEMPERATURE_degC,
-    RESET_LSB_XY_uT,
-    RESET_LSB_Z_uT,
-    find_lsb,
-)
+from reskin.board.chips import RESET_LSB_XY_uT, RESET_LSB_Z_uT
+from reskin.board.faults import INT16_STEPS_N, FAILED_B_uT, FAILED_TEMPERATURE_degC, find_lsb
 from reskin.board.wire import Frames
 from reskin.live.emulator import Script, encode_pieces
 from reskin.seeds import rng_for

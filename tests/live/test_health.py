@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
+from reskin.board.chips import RESET_LSB_XY_uT, RESET_LSB_Z_uT
+from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
 from reskin.board.wire import Frames
 from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, READINGS_REPEAT, REPEATS_FRAMES_N, Health
 from reskin.recordings.fault_policy import override
