@@ -1,12 +1,11 @@
-"""Estimate contacts, places and forces in a log, and score the estimates against labels.
+"""Find the start without contact and the contacts in a log, and summarise the estimates of a log.
 
 A log is a recording of the field over time. Section 6 of the paper shows logs of a dog's shoe and of a glove. A log
 must begin with some time without contact, which is called the quiet start here. The mean field of the quiet start is
 the no-load reading, which is subtracted from all readings of the log.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.special import ndtri
 
 from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.errors import CaptureError
-from reskin.metrics import score
 
 # To find the end of the quiet start, the log is divided into windows of this length, which is an assumed value. The
 # mean field of each window is compared with the mean field at the start of the log.
@@ -27,56 +25,10 @@ FALSE_SHARE = 0.002
 FEW_READINGS = 1.5  # the limit is larger by this number divided by the square root of the number of readings
 NORMAL_1SD = 0.683  # this share of normally distributed numbers is within one standard deviation
 START_WINDOWS_N = 2  # number of windows that are the start of the log, from which mean and noise are estimated
-POINTS_MAX_N = 1500  # largest number of points that a curve in a figure has
 
-# A model: a function that estimates x_mm, y_mm and F_N from field changes in uT.
-Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 # A function that is called with the noise of the readings in uT. It returns a matrix that removes external fields from
 # readings, or None if they are not to be removed.
 FindSuppressor = Callable[[float], Float64[np.ndarray, "ch ch"] | None]
-
-
-@dataclass(frozen=True)
-class LogEstimates:
-    """The estimates for all f readings of a log.
-
-    t_s: the time of each reading.
-    targets: the estimated places and forces. They are meaningful only for readings in contact.
-    contact: whether each reading is in contact.
-    quiet_n: the number of readings in the quiet start.
-    noise_uT: the rms of the field change over all readings and channels of the quiet start.
-    """
-
-    t_s: Float64[np.ndarray, " f"]
-    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm and F_N, as estimated by each of m models
-    contact: Bool[np.ndarray, " f"]
-    quiet_n: int
-    noise_uT: float
-
-
-def estimate(
-    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str,
-    find_suppressor: FindSuppressor | None = None,
-) -> LogEstimates:  # fmt: skip
-    """Estimate the contacts in a log, and the place and the force of each reading.
-
-    First, the quiet start of the log is found, and its mean field is subtracted from all readings. `find_suppressor`
-    gives the matrix that removes external fields when contacts are detected.
-
-    Raises CaptureError, with `where` in its message, if the quiet start is too short for a no-load reading.
-    """
-    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models, find_suppressor)
-
-
-def estimate_after(
-    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator],
-    find_suppressor: FindSuppressor | None = None,
-) -> LogEstimates:  # fmt: skip
-    """Estimate as `estimate` does, but with a given quiet start, which consists of the first `quiet_n` readings."""
-    detector = ContactDetector(b_uT[:quiet_n], find_suppressor)
-    db_uT = detector.change_uT(b_uT)
-    targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
-    return LogEstimates(t_s, targets, detector.contact(db_uT), quiet_n, detector.noise_uT)
 
 
 class ContactDetector:
@@ -196,80 +148,3 @@ class LogSummary:
         duration_s = self._last_s - self._first_s + self._step_s
         counts = self._counts | {"duration_s": duration_s, "contacts_n": self._counts["contacts_n"] + last_n}
         return counts | ({"force_max_N": float(self._force_N[0].mean())} if self._force_N else {})
-
-
-def describe(log: LogEstimates) -> dict[str, Any]:
-    """Summarise a log (see `LogSummary`)."""
-    summary = LogSummary(step_s(log.t_s), log.quiet_n, log.noise_uT)
-    summary.feed(log.t_s, log.contact, log.targets[:, log.contact, 2])
-    return summary.counts()
-
-
-def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score the estimates of a log against true values.
-
-    `true` contains the true x_mm, y_mm and F_N of each reading. Readings without contact have NaN. Places and forces
-    are scored for the readings that are in contact and in which a contact was detected. The result also contains the
-    numbers of readings in which a contact was missed or falsely detected.
-
-    Each model is scored separately. The result contains the means of the scores over the models. With several models,
-    its entry `spread` contains their standard deviations.
-    """
-    truly_touched = np.isfinite(true[:, 2])
-    both_touched = log.contact & truly_touched
-    counts: dict[str, Any] = {
-        "contacts_true_n": contacts_n(truly_touched),
-        "missed_readings_n": int((truly_touched & ~log.contact).sum()),
-        "false_readings_n": int((log.contact & ~truly_touched).sum()),
-        "force_true_max_N": float(np.nanmax(true[:, 2])),
-    }
-    if counts["missed_readings_n"]:
-        counts["missed_force_max_N"] = float(true[truly_touched & ~log.contact, 2].max())
-    if not both_touched.any():
-        return counts
-    scores = [score(true[both_touched], target[both_touched]) for target in log.targets]
-    by_name = {name: np.array([model_scores[name] for model_scores in scores]) for name in scores[0]}
-    spread = {name: float(values.std(ddof=1)) for name, values in by_name.items()} if len(scores) > 1 else {}
-    return (
-        counts
-        | {name: float(values.mean()) for name, values in by_name.items()}
-        | ({"spread": spread} if spread else {})
-    )
-
-
-def truth_at(
-    t_s: Float64[np.ndarray, " f"],
-    start_s: Float64[np.ndarray, " d"],
-    end_s: Float64[np.ndarray, " d"],
-    true: Float[np.ndarray, "d 3"],
-) -> Float64[np.ndarray, "f 3"]:
-    """Return the true x_mm, y_mm and F_N of each reading of a recording that a robot made.
-
-    A dwell is a stop of the robot at one place; it lasts from `start_s` to `end_s`. The true values of a reading are
-    the values of the dwell during which the reading was taken. Readings between dwells have NaN.
-    """
-    dwell_i = np.searchsorted(start_s, t_s, "right") - 1
-    inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
-    return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
-
-
-def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Reduce a log to the data of a figure: the estimates of at most 1,500 evenly spaced readings.
-
-    The entry `estimated` contains the estimates of the first model. With several models, the entries `low` and `high`
-    contain the smallest and the largest estimates of all models. For readings without contact, the estimates are None.
-    """
-    kept = np.unique(np.linspace(0, len(log.t_s) - 1, POINTS_MAX_N).astype(int))
-    targets = np.where(log.contact[:, None], log.targets, np.nan)[:, kept]
-    plot_data: dict[str, Any] = {"t_s": np.round(log.t_s[kept], 3).tolist(), "estimated": _columns(targets[0])}
-    if len(targets) > 1:
-        plot_data |= {"low": _columns(targets.min(axis=0)), "high": _columns(targets.max(axis=0))}
-    return plot_data if true is None else plot_data | {"true": _columns(true[kept])}
-
-
-def _columns(rows: Float64[np.ndarray, "f 3"]) -> dict[str, list[float | None]]:
-    names = ("x_mm", "y_mm", "F_N")
-    return {
-        name: [None if np.isnan(value) else round(float(value), 2) for value in column]
-        for name, column in zip(names, rows.T, strict=True)
-    }

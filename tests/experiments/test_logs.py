@@ -12,23 +12,16 @@ from scipy.stats import norm
 from pipeline.experiments.logs import (
     PITCHES_DEG,
     Log,
-    earth_in_board_T,
-    score_pitches,
-)
-from reskin.errors import CaptureError
-from reskin.logs import (
-    FALSE_SHARE,
-    QUIET_MIN_S,
-    START_WINDOWS_N,
-    WINDOW_S,
-    contacts_n,
     describe,
+    earth_in_board_T,
     estimate,
-    quiet_start,
     score_contacts,
+    score_pitches,
     thin,
     truth_at,
 )
+from reskin.errors import CaptureError
+from reskin.logs import FALSE_SHARE, QUIET_MIN_S, START_WINDOWS_N, WINDOW_S, contacts_n, quiet_start
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, Instrument
 from reskin.physics.board import Board
 from reskin.seeds import rng_for
@@ -58,6 +51,10 @@ def predict(db_uT):
     return np.stack([np.full(len(db_uT), 8.0), np.full(len(db_uT), 4.0), force_N], axis=1).astype(np.float32)
 
 
+def estimate_log(t_s, b_uT, networks):
+    return estimate(quiet_start(t_s, b_uT, where="log"), t_s, b_uT, networks)
+
+
 def truth(force_N):
     rows = np.stack([np.full(len(force_N), 8.0), np.full(len(force_N), 4.0), force_N], axis=1)
     return np.where(force_N[:, None] > 0, rows, np.nan)
@@ -82,7 +79,7 @@ def test_log_that_begins_with_a_contact_is_refused():
 
 def test_number_of_contacts_forces_and_noise_are_recovered():
     t_s, b_uT, force_N = make_log()
-    found = estimate(t_s, b_uT, [predict], where="log")
+    found = estimate_log(t_s, b_uT, [predict])
     np.testing.assert_array_equal(found.contact, force_N > 0)
     numbers = describe(found)
     assert numbers["contacts_n"] == 4
@@ -102,14 +99,14 @@ def test_number_of_contacts_forces_and_noise_are_recovered():
 def test_score_is_the_mean_score_of_networks_and_not_that_of_their_mean_prediction():
     t_s, b_uT, force_N = make_log()
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
-    found = estimate(t_s, b_uT, networks, where="log")
+    found = estimate_log(t_s, b_uT, networks)
     scores = score_contacts(found, truth(force_N))
     # The mean prediction of the three networks would have a squared error of 0.44 N^2.
     assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)
     assert scores["spread"]["mse_f_N2"] == pytest.approx(np.std([1, 1, 4], ddof=1), rel=0.02)
     # The largest force is the mean of the largest forces of the three networks, which are 3, 5 and 6 N.
     assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)
-    assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
+    assert "spread" not in score_contacts(estimate_log(t_s, b_uT, networks[:1]), truth(force_N))
 
 
 @pytest.mark.parametrize(("share", "is_found"), [(0.75, False), (1.25, True)])
@@ -130,7 +127,7 @@ def test_quiet_start_ends_at_a_pulse_that_noise_does_not_explain(share, is_found
 def test_plotted_range_contains_the_estimates_of_all_networks():
     t_s, b_uT, force_N = make_log()
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
-    plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
+    plotted = thin(estimate_log(t_s, b_uT, networks), truth(force_N))
     assert [np.nanmax(np.array(plotted[which]["x_mm"], float)) for which in ("low", "estimated", "high")] == [6, 8, 9]
 
 
@@ -153,7 +150,7 @@ def instrument(noise_uT=0.0):
 
 def pitched_log(noise_uT=0.0):
     t_s, b_uT, force_N = make_log()
-    quiet_n = estimate(t_s, b_uT, [predict], where="log").quiet_n
+    quiet_n = quiet_start(t_s, b_uT, where="log")
     log = Log(t_s, b_uT, truth(force_N), quiet_n)
     return log, score_pitches(log, instrument(noise_uT), [predict], rng_for(0, "aside"))
 
@@ -176,7 +173,7 @@ def test_length_of_the_change_of_the_earth_field_equals_the_chord_of_the_rotatio
 
 def test_scores_at_pitch_zero_equal_the_scores_of_the_log():
     log, rows = pitched_log()
-    found = estimate(log.t_s, log.b_uT, [predict], where="log")
+    found = estimate_log(log.t_s, log.b_uT, [predict])
     level = rows[0]
     assert level["pitch_deg"] == 0
     assert level["contacts_n"] == contacts_n(found.contact) == 4
