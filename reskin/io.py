@@ -325,13 +325,6 @@ def read_batches(path: Path, rows_n: int) -> Iterator[pa.Table]:
                 yield pa.Table.from_batches([batch])
 
 
-def read_column_names(path: Path) -> list[str]:
-    """Read the names of the columns of a table, without reading its rows."""
-    with _parquet(path) as file:
-        names: list[str] = file.schema_arrow.names
-    return names
-
-
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
     """Write the readings of one capture block by block, and then the counts of its ingestion.
 

@@ -21,6 +21,7 @@ from reskin.recordings.header import LOG_FILE, PROBE_FILE, RATE_MAX_HZ, STREAM_F
 from reskin.recordings.ingest import open_capture, read_header, timer
 from reskin.recordings.preparing import UNNAMED, CaptureNames, foreign, layouts_of
 from reskin.recordings.readers import READERS, sd_card
+from reskin.recordings.tables import TableFile
 from reskin.schema import LABELS, UNITS, Readings, unit_of
 
 if TYPE_CHECKING:
@@ -131,12 +132,7 @@ def kind_of(file: Path) -> str:
     """Return the kind of a file: `table` or `ingested` if it has the column names of this kind, and `log` otherwise."""
     if not file.is_file():
         raise CaptureError(f"{file}: file not found. Check the path.")
-    with file.open("rb") as stream:
-        head = stream.read(sd_card.HEADER_CHARACTERS_MAX)
-    if head.startswith(io.PARQUET_MAGIC):
-        names = io.read_column_names(file)
-    else:
-        names = [name.strip() for name in head.decode("utf-8-sig", errors="replace").partition("\n")[0].split(",")]
+    names = TableFile(file, str(file)).names
     return "table" if "phase" in names else "ingested" if set(UNITS) <= set(names) else "log"
 
 

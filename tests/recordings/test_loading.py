@@ -135,6 +135,8 @@ def test_table_file_is_read_like_a_capture_of_its_layout(tmp_path):
     # Tolerance: the CSV has only as many digits as single precision needs, so the means of no-load fields differ by
     # rounding.
     pd.testing.assert_frame_equal(frame, reskin.load_recording(tmp_path / "my table.parquet"), rtol=1e-6, atol=1e-4)
+    (tmp_path / "my table.csv").write_text(render_csv(pa.table(columns)).replace(",", ";"))
+    pd.testing.assert_frame_equal(frame, reskin.load_recording(tmp_path / "my table.csv"))
     np.testing.assert_array_equal(frame[CHANNELS], b_uT[contact])
     assert (set(frame["capture"]), set(frame["board"])) == ({"my_table"}, {"unnamed"})
     counts = frame.attrs["counts"]
@@ -151,7 +153,7 @@ def test_load_recording_raises_an_error_that_names_the_unreadable_file(tmp_path)
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "cut.parquet").read_bytes()[:-20])
     for name, message in (
         ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "line 1 has no column t_s"),
-        ("other.parquet", "not those that `reskin decode` writes"), ("cut.parquet", "cannot be read as a Parquet file"),
+        ("other.parquet", "not those that `reskin decode` writes"), ("cut.parquet", "cannot be read as a table"),
     ):  # fmt: skip
         with pytest.raises(ReskinError, match=rf"{name}.*{message}"):
             reskin.load_recording(tmp_path / name)

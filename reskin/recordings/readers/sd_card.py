@@ -19,7 +19,6 @@ from reskin.recordings.tables import FIRST_ROW, TableFile, count_chips_of
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
 TORN_SHARE_MAX = 0.5  # assumed: with a larger share of torn lines, the log is refused
 # times in s, fields in uT, temperatures in degC, and an account (counts by name)
 Log = tuple[Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]]
