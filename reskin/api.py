@@ -567,7 +567,7 @@ def open(
     ...     for contact in skin:
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
     """
-    from reskin.board.custom import custom_wire
+    from reskin.board.other_firmware import custom_wire
     from reskin.live.tracker import LiveSkin, LiveSkins, check_ports
 
     models, custom = _load_all(model), custom_wire(wire, "wire")

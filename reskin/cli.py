@@ -242,8 +242,8 @@ def record(
     With --labels, the places and forces of presses are recorded too. Labels from the log of a robot can also be added
     later, with `reskin add`.
     """
-    from reskin.board.custom import CustomWire, read_wire
     from reskin.board.find import DetectedBoard, find_board
+    from reskin.board.other_firmware import CustomWire, read_wire
     from reskin.live.record import label_source, record_board
 
     label_of = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
@@ -366,8 +366,8 @@ def live(
     """
     from contextlib import ExitStack
 
-    from reskin.board.custom import custom_wire
     from reskin.board.find import find_boards
+    from reskin.board.other_firmware import custom_wire
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
     from reskin.live.models import SkinFolder
@@ -418,7 +418,7 @@ def decode(
     chips_n: Chips = 5,
 ) -> None:
     """Decode raw bytes that were read from a port; write a table with one row per frame, and count the lost bytes."""
-    from reskin.board.custom import CustomWire, read_wire
+    from reskin.board.other_firmware import CustomWire, read_wire
     from reskin.recordings.decode import decode_file
 
     form = read_wire(wire)

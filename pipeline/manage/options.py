@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from reskin.board.custom import CustomWire, read_wire
+from reskin.board.other_firmware import CustomWire, read_wire
 from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout, preparing
 from reskin.recordings.preparing import CaptureNames, Prepared

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from reskin.board import faults, rates
-from reskin.board.custom import AnyWire, CustomWire
+from reskin.board.other_firmware import AnyWire, CustomWire
 from reskin.board.port import BAUD, Chunk, open_port, port_names, read_waiting
 from reskin.board.rates import RateMeasurement
 from reskin.board.stream import FrameStream, decode_all, describe_unknown, matching_formats

@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from reskin.board import wire as wires
 from reskin.board.chips import B_PLAUSIBLE_uT, TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
-from reskin.board.custom import AnyWire, CustomWire
+from reskin.board.other_firmware import AnyWire, CustomWire
 from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run, Wire
 from reskin.errors import CaptureError
 

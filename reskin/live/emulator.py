@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from reskin import io
-from reskin.board.custom import CustomWire
+from reskin.board.other_firmware import CustomWire
 from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml

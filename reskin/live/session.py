@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from reskin.board.custom import CustomWire
+from reskin.board.other_firmware import CustomWire
 from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY

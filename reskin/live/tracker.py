@@ -24,8 +24,8 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from reskin.board import find
-from reskin.board.custom import CustomWire
 from reskin.board.faults import GARBAGE_FRAMES_N
+from reskin.board.other_firmware import CustomWire
 from reskin.board.port import BAUD, PLUGGED_IN, Chunk, Reader, check_name
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate

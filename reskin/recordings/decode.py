@@ -13,7 +13,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from reskin import io
-from reskin.board.custom import AnyWire
+from reskin.board.other_firmware import AnyWire
 from reskin.board.stream import FrameStream, no_frame
 from reskin.board.wire import Frames, record_type
 from reskin.errors import CaptureError

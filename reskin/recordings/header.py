@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from reskin import io
-from reskin.board.custom import AnyWire
+from reskin.board.other_firmware import AnyWire
 from reskin.config import Strict
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout

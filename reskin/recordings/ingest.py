@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from reskin import io
 from reskin.board.chips import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
-from reskin.board.custom import AnyWire, frame_bytes_of
 from reskin.board.faults import FaultDetector, find_reading_faults
+from reskin.board.other_firmware import AnyWire, frame_bytes_of
 from reskin.board.stream import FrameStream, no_frame
 from reskin.board.wire import TEXT_WIRES, Frames
 from reskin.errors import CaptureError

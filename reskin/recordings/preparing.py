@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from reskin import io
 from reskin.board import stream
-from reskin.board.custom import AnyWire
+from reskin.board.other_firmware import AnyWire
 from reskin.board.wire import TEXT_WIRES
 from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings import ReaderLayout, clocks, column_map

@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from reskin import io
-from reskin.board.custom import AnyWire, is_line
+from reskin.board.other_firmware import AnyWire, is_line
 from reskin.board.port import found_ports, open_port, read_waiting
 from reskin.board.rates import RateMeasurement, RateMeter
 from reskin.board.stream import HEAD_BYTES_N, FrameStream, no_frame

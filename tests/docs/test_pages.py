@@ -22,7 +22,7 @@ import reskin.cli
 from pipeline.scenes import check_scene
 from pipeline.scores import KEYS
 from pipeline.settings import Settings, read_shared_files
-from reskin.board.custom import read_wire
+from reskin.board.other_firmware import read_wire
 from reskin.data.rows import TARGETS
 from reskin.metrics import METRICS
 from reskin.recordings.column_map import read_map

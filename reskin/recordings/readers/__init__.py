@@ -2,7 +2,7 @@
 
 - a table with named columns (CSV, Parquet, ...) that has the names and units of layout `table`: `table`
 - any other table or log with labels: option --columns of `reskin add`, a YAML file of its columns; `column_map`
-- bytes or lines of text as a board sends them: a layout file of its wire for option --wire; `reskin.board.custom`
+- bytes or lines of text as a board sends them: option --wire, a YAML file of them; `reskin.board.other_firmware`
 - a log without labels in the columns of an SD card: `sd_card`
 - files of a public data set: `lab` (a map of columns in Python), `ini`, `eflesh` and `leaphand`
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reskin.board.custom import CustomWire, custom_wire, read_wire
 from reskin.board.find import recognise
+from reskin.board.other_firmware import CustomWire, custom_wire, read_wire
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode
 from reskin.errors import CaptureError, ParamsError
