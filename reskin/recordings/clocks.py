@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int8, Int64
 
-from reskin.board.faults import MICROS_WRAP_S, clock_resolution_s, clock_steps
 from reskin.errors import CaptureError
 from reskin.recordings import tables
 from reskin.recordings.probe import ProbeLog
@@ -81,49 +80,6 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
     s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
     before_s = np.minimum(end_byte - byte_end[0], 0) * s_per_byte
     return np.interp(end_byte, byte_end, t_s, right=np.nan) + before_s
-
-
-def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Return the time of each frame in s, counted from the start of the stream, if the frame rate is constant.
-
-    `frame` is the position in the stream at which each frame ends, measured in frames. If all frames have the same
-    length, damaged bytes then also count as time. Otherwise, it is the number of the frame, counted from 1.
-    """
-    return frame / rate_hz
-
-
-class BoardClock:
-    """The times of frames on the board's clock, continued where micros() starts again from 0 (after 71.6 minutes).
-
-    The board sends the time in s as float32. After hours, the resolution of this number is coarser than the time
-    between two frames. The frames are then spread evenly, in proportion to their positions in the stream, between the
-    first and the last time. Frames may be passed in several parts. `account` counts the frames whose times are spread,
-    and states the resolution.
-    """
-
-    def __init__(self) -> None:
-        self.account: dict[str, int] = {}
-        self._offset_s = 0.0
-        self._last: tuple[float, float, int] | None = None  # device time, time and position of the last frame
-
-    def times_of(
-        self, device_s: Float64[np.ndarray, " f"], end_byte: Int64[np.ndarray, " f"]
-    ) -> Float64[np.ndarray, " f"]:
-        """Return the times in s of the next frames; `end_byte` is the position of their ends in the stream."""
-        if not len(device_s):
-            return device_s
-        device_s = device_s.astype(np.float64)
-        last_device_s, begin_s, begin_byte = self._last or (device_s[0], device_s[0], end_byte[0])
-        wraps = clock_steps(device_s, last_device_s) != np.diff(device_s, prepend=last_device_s)
-        t_s = device_s + self._offset_s + MICROS_WRAP_S * np.cumsum(wraps)
-        self._offset_s += MICROS_WRAP_S * int(wraps.sum())
-        resolution_s, lasts_s = clock_resolution_s(device_s), t_s[-1] - begin_s
-        if lasts_s > 0 and resolution_s > lasts_s / len(t_s) / 2:
-            t_s = begin_s + (end_byte - begin_byte) * (lasts_s / (end_byte[-1] - begin_byte))
-            self.account["coarse_clock_frames_n"] = self.account.get("coarse_clock_frames_n", 0) + len(t_s)
-            self.account["clock_resolution_us"] = round(1e6 * resolution_s)
-        self._last = float(device_s[-1]), float(t_s[-1]), int(end_byte[-1])
-        return t_s
 
 
 # The fitted rate of the clock (seconds of probe time per second of stream time) may differ from 1 by at most this
@@ -298,16 +254,11 @@ def _follow(
 
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
-    """Correlate two signals at every lag at which they overlap, by the fast Fourier transform.
+    """Correlate two signals at every lag at which they overlap."""
+    # imported here, because only captures without clock marks need it, and its import takes half a second
+    from scipy.signal import correlate
 
-    The function scipy.signal.correlate is not used, because its import takes a second.
-    """
-    # imported here, because only captures without clock marks need it
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    lags_n = len(signal) + len(window) - 1
-    size = next_fast_len(lags_n, real=True)
-    return irfft(rfft(signal, size) * rfft(window[::-1], size), size)[:lags_n]
+    return np.asarray(correlate(signal, window, method="fft"))
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:

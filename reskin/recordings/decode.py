@@ -11,13 +11,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
+from jaxtyping import Float64, Int64
 
 from reskin import io
+from reskin.board.faults import MICROS_WRAP_S, clock_resolution_s, clock_steps
 from reskin.board.other_firmware import AnyWire
 from reskin.board.stream import FrameStream, no_frame
 from reskin.board.wire import Frames, record_type
 from reskin.errors import CaptureError
-from reskin.recordings import clocks
 
 BLOCK_BYTES_N = 2**24  # bytes of a dump that are decoded at once; they become one row group of a Parquet file
 BLOCK_ROWS_N = 2**16  # rows of a table that are read at once
@@ -77,6 +78,40 @@ def _table(frames: Frames, schema: pa.Schema) -> pa.Table:
     return pa.Table.from_arrays([pa.array(np.ascontiguousarray(column)) for column in values], schema=schema)
 
 
+class BoardClock:
+    """The times of frames on the board's clock, continued where micros() starts again from 0 (after 71.6 minutes).
+
+    The board sends the time in s as float32. After hours, the resolution of this number is coarser than the time
+    between two frames. The frames are then spread evenly, in proportion to their positions in the stream, between the
+    first and the last time. Frames may be passed in several parts. `account` counts the frames whose times are spread,
+    and states the resolution.
+    """
+
+    def __init__(self) -> None:
+        self.account: dict[str, int] = {}
+        self._offset_s = 0.0
+        self._last: tuple[float, float, int] | None = None  # device time, time and position of the last frame
+
+    def times_of(
+        self, device_s: Float64[np.ndarray, " f"], end_byte: Int64[np.ndarray, " f"]
+    ) -> Float64[np.ndarray, " f"]:
+        """Return the times in s of the next frames; `end_byte` is the position of their ends in the stream."""
+        if not len(device_s):
+            return device_s
+        device_s = device_s.astype(np.float64)
+        last_device_s, begin_s, begin_byte = self._last or (device_s[0], device_s[0], end_byte[0])
+        wraps = clock_steps(device_s, last_device_s) != np.diff(device_s, prepend=last_device_s)
+        t_s = device_s + self._offset_s + MICROS_WRAP_S * np.cumsum(wraps)
+        self._offset_s += MICROS_WRAP_S * int(wraps.sum())
+        resolution_s, lasts_s = clock_resolution_s(device_s), t_s[-1] - begin_s
+        if lasts_s > 0 and resolution_s > lasts_s / len(t_s) / 2:
+            t_s = begin_s + (end_byte - begin_byte) * (lasts_s / (end_byte[-1] - begin_byte))
+            self.account["coarse_clock_frames_n"] = self.account.get("coarse_clock_frames_n", 0) + len(t_s)
+            self.account["clock_resolution_us"] = round(1e6 * resolution_s)
+        self._last = float(device_s[-1]), float(t_s[-1]), int(end_byte[-1])
+        return t_s
+
+
 def read_frame_blocks(file: Path, rate_hz: float, account: dict[str, int]) -> Iterator[Frames]:
     """Yield the frames of a decoded dump; `device_s` is their time in s, and `end_byte` the number of their row.
 
@@ -86,7 +121,7 @@ def read_frame_blocks(file: Path, rate_hz: float, account: dict[str, int]) -> It
     they are computed from the numbers of the frames.
     """
     where = str(file)
-    clock, rows_n, last_byte, has_clock, is_binary = clocks.BoardClock(), 0, 0, None, None
+    clock, rows_n, last_byte, has_clock, is_binary = BoardClock(), 0, 0, None, None
     for table in io.read_batches(file, BLOCK_ROWS_N):
         chips_n = sum(name.startswith("temperature") for name in table.column_names)
         if table.column_names != list(frame_columns(chips_n)):
@@ -117,7 +152,7 @@ def read_frame_blocks(file: Path, rate_hz: float, account: dict[str, int]) -> It
             t_s = clock.times_of(device_s, end_byte)
         else:
             frame = end_byte / record_type("binary", chips_n).itemsize if is_binary else row_n.astype(np.float64)
-            t_s = clocks.constant_rate(frame, rate_hz)
+            t_s = frame / rate_hz
         yield Frames(b_uT, temperature_degC, t_s, row_n)
         rows_n, last_byte = rows_n + len(table), int(end_byte[-1]) if len(table) else last_byte
     account.update(clock.account)

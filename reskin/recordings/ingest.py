@@ -381,9 +381,10 @@ def timer(folder: Path, header: Header) -> Timer:
         raise CaptureError(
             folder, "clock.kind", "'arrivals' or 'rate', if a port was recorded", got, "Correct header.json."
         )
+    # The rate is constant. If all frames have the same length, damaged bytes also count as time; lines of text vary.
     if (frame_bytes_n := frame_bytes_of(_wire(header), header.chips_n)) is None:
-        return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
-    return lambda frames, _: clocks.constant_rate(frames.end_byte / frame_bytes_n, rate_hz)
+        return lambda frames, before_n: (before_n + 1.0 + np.arange(len(frames))) / rate_hz
+    return lambda frames, _: frames.end_byte / frame_bytes_n / rate_hz
 
 
 def _arrivals(folder: Path) -> Arrivals:

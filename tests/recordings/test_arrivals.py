@@ -58,11 +58,6 @@ def test_frame_that_ends_after_the_last_chunk_has_no_time() -> None:
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 
 
-def test_time_at_a_constant_rate_is_the_frame_number_divided_by_the_rate() -> None:
-    t_s = clocks.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
-    np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
-
-
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e9, 1e9)))
 def test_written_arrival_times_are_read_unchanged(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
