@@ -26,10 +26,9 @@ from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.probe import CONTACT, LABELS, NOLOAD, TYPES
-from reskin.recordings.tables import NUMBER_PATTERN
+from reskin.recordings.tables import MAGNITUDE_MAX, NUMBER_PATTERN
 from reskin.recordings.units import SAME_PLACE_mm
 
-FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # resolution of the written times
 TIME_MAX_s = 1e11  # unix time in seconds stays below this value for 3,000 years; unix time in milliseconds is above it
 # Possible names of the column of times: `unix_s` if the times are those of this machine's clock, `t_s` if the source of
@@ -173,8 +172,9 @@ def same_place(a: Label, b: Label) -> bool:
 def _check(dwell: Dwell) -> None:
     for name in LABELS:
         value = getattr(dwell.label, name)
-        if math.isinf(value) or abs(value) > FLOAT32_MAX:
-            raise CaptureError("a label", name, "a finite number", value, "Leave out numbers that are not known.")
+        if abs(value) >= MAGNITUDE_MAX:  # False for NaN
+            rule = f"a number below {MAGNITUDE_MAX:g}"
+            raise CaptureError("a label", name, rule, value, "Leave out numbers that are not known.")
     if not 0 <= dwell.label.pass_i < 2**31:
         raise CaptureError("a label", "pass_i", "0 or more", dwell.label.pass_i, "Number the passes from 0.")
     if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # False for NaN

@@ -86,12 +86,6 @@ def render(log: ProbeLog) -> str:
 
 def _check(log: ProbeLog, where: str) -> None:
     """Raise `CaptureError` for the first row with an invalid number, or in a wrong order."""
-    for name in LABELS:
-        values, remedy = getattr(log, name), "If the value is unknown, leave this field empty."
-        refuse_row(np.isinf(values), where, name, "finite, or empty if unknown", values, remedy)
-    for name in ("t_start_s", "t_end_s"):
-        values, remedy = getattr(log, name), "Correct this time, or remove the row."
-        refuse_row(~np.isfinite(values), where, name, "a finite time", values, remedy)
     for name in ("indentation", "pass_i"):
         values = getattr(log, name)
         refuse_row(values < 0, where, name, "0 or more", values, "Number indentations and passes from 0.")
