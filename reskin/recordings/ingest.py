@@ -361,7 +361,7 @@ def _check_units(frames: Frames, wire: AnyWire, where: str) -> bool:
             rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and similar for all chips"
             remedy = f"If the board sends wire format {other}, state this format in header.json."
             raise CaptureError(where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
-    check_fields(b_uT, where, first_line_n=1)
+    check_fields(b_uT, where)
     return True
 
 

@@ -37,75 +37,79 @@ STEP_RULE = "0.1 to 100 uT, or that of a chip in reskin/board/chips.py"
 
 
 def check_fields(
-    b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int = 1, line_n: Int[np.ndarray, " f"] | None = None
+    b_uT: Float[np.ndarray, "f ch"],
+    where: str,
+    *,
+    line_n: Int[np.ndarray, " f"] | None = None,
+    subtracted: bool = False,
 ) -> None:
-    """Raise if raw fields are probably not in uT. `line_n` has the line of each row, if they do not follow one another.
+    """Raise if fields are probably not in uT. `line_n` has the line of each row, if they are not 1, 2, 3, ...
 
-    There are three signs of another unit: the fields exceed the chip's full scale; they are weaker than the earth's
-    field; or the steps between their values are not possible for the chip in uT. The steps can be detected only if the
-    values were neither averaged nor rounded to a few decimals.
+    There are four signs of another unit: the fields exceed the chip's full scale; they are weaker than the earth's
+    field; they are raw counts; or the steps between their values are not possible for the chip in uT. The steps can be
+    detected only if the values were neither averaged nor rounded to a few decimals. If a no-load field was subtracted
+    from the fields, they may be weak, so the second and third sign are not used.
     """
-    _check_full_scale(b_uT, where, first_line_n + np.arange(len(b_uT)) if line_n is None else line_n)
+    _check_full_scale(b_uT, where, line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
-    if usual_uT < WEAKEST_uT:
-        rule = f"{WEAKEST_uT:g} uT or more on most chips, because the earth's field alone is stronger"
-        raise CaptureError(
-            where, "field", rule, f"{usual_uT:.4g}", "If the unit of the file is mT or G, convert the fields to uT."
-        )
-    _refuse_counts(b_uT, where)
+    if not subtracted:
+        if usual_uT < WEAKEST_uT:
+            rule = f"{WEAKEST_uT:g} uT or more on most chips, because the earth's field alone is stronger"
+            remedy = "If the unit of the file is mT or G, convert the fields to uT."
+            raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", remedy)
+        _refuse_counts(b_uT, where)
     step_uT = _find_step(b_uT)
     if chips.is_step(step_uT):
         return
-    if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < chips.STEP_MIN_uT):
-        unit = "nT" if step_uT > NANO_STEP_MIN else "G"
+    may_be_gauss = subtracted or usual_uT < GAUSS_MAX
+    if step_uT > NANO_STEP_MIN or (may_be_gauss and step_uT < chips.STEP_MIN_uT):
+        unit = "nT" if step_uT > NANO_STEP_MIN else "mT or G" if subtracted else "G"
         remedy = f"The unit is probably {unit}. Convert the fields to uT."
         raise CaptureError(where, "the step between values of the field", STEP_RULE, f"{step_uT:.3g}", remedy)
 
 
-def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if field changes are probably not in uT.
+def check_labels(
+    labels: Mapping[str, Float[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str, *, first_line_n: int
+) -> None:
+    """Raise if places, depths or forces, by the name of their column, are probably not in mm and N.
 
-    There are two signs of another unit: the changes exceed the chip's full scale, or the steps between their values are
-    not possible for the chip in uT. Unlike raw fields, field changes may be weak.
+    Columns may be missing, and values may be unknown (NaN). Also raises if the force Fz is negative in compression.
     """
-    _check_full_scale(db_uT, where, first_line_n + np.arange(len(db_uT)))
-    step_uT = _find_step(db_uT)
-    if chips.is_step(step_uT):
-        return
-    if step_uT > NANO_STEP_MIN or step_uT < chips.STEP_MIN_uT:
-        remedy = "The unit is probably nT, mT or G. Convert the field changes to uT."
-        raise CaptureError(where, "the step between values of the field change", STEP_RULE, f"{step_uT:.3g}", remedy)
-
-
-def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
-    """Raise if a force exceeds `FORCE_MAX_N`, which suggests that forces are in grams or mN; ignore NaN (unknown)."""
-    too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
-    if len(too_strong):
-        got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
-        raise CaptureError(
-            where,
-            "force",
-            f"below {FORCE_MAX_N:g} N",
-            got,
-            "If the unit of the file is g or mN, convert the forces to N.",
-        )
-
-
-def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if all known forces are below `FORCE_MIN_N`, which suggests that they are in kg or kN.
-
-    The forces may be all 0, or all unknown (NaN).
-    """
-    strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
+    forces = [labels[axis] for axis in ("Fx_N", "Fy_N", "Fz_N") if axis in labels]
+    for force_N in forces:
+        too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
+        if len(too_strong):
+            got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
+            remedy = "If the unit of the file is g or mN, convert the forces to N."
+            raise CaptureError(where, "force", f"below {FORCE_MAX_N:g} N", got, remedy)
+    strongest_N = max(
+        (np.abs(force_N[contact & np.isfinite(force_N)]).max(initial=0.0) for force_N in forces), default=0.0
+    )
     if 0 < strongest_N < FORCE_MIN_N:
-        got = f"{strongest_N:.3g} N at most"
         rule = f"at least {FORCE_MIN_N:g} N in one or more rows with contact"
-        raise CaptureError(
-            where, "force", rule, got, "If the unit is kg or kN, convert the forces to N; otherwise, press harder."
-        )
+        remedy = "If the unit is kg or kN, convert the forces to N; otherwise, press harder."
+        raise CaptureError(where, "force", rule, f"{strongest_N:.3g} N at most", remedy)
+    place_mm = np.stack([labels["x_mm"], labels["y_mm"]], axis=1)
+    _check_places(np.where(contact[:, None], place_mm, np.nan), where, first_line_n)
+    depth_mm = labels["depth_mm"][contact] if "depth_mm" in labels else np.zeros(0)
+    deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
+    if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
+        rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm"
+        remedy = "If the unit of the file is m or um, convert the depths to mm."
+        raise CaptureError(where, "the greatest depth", rule, f"{deepest_mm:.4g}", remedy)
+    pressed_N = labels["Fz_N"][contact & np.isfinite(labels["Fz_N"])] if "Fz_N" in labels else np.zeros(0)
+    if len(pressed_N) and np.median(pressed_N) < 0:
+        got = f"{np.median(pressed_N):.4g} N"
+        remedy = "Reverse the sign of Fz_N in the file or in the map of columns."
+        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, remedy)
 
 
-def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
+def check_log(log: ProbeLog, where: str) -> None:
+    """Check the labels of a probe log; see `check_labels`."""
+    check_labels({name: getattr(log, name) for name in LABELS}, log.contact, where, first_line_n=FIRST_ROW)
+
+
+def _check_places(place_mm: Float[np.ndarray, "f axes"], where: str, first_line_n: int) -> None:
     """Raise if the extent of the places is too small or too large for a skin, which suggests another unit than mm.
 
     Unknown places (NaN) are ignored. A recording with a single place is accepted.
@@ -119,53 +123,11 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
         is_far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
         if 0 < is_far.sum() <= FAR_SHARE_MAX * len(is_far):
             i = int(is_far.argmax())
-            line_n, place = (
-                first_line_n + int(np.flatnonzero(known)[i]),
-                ", ".join(f"{value:g}" for value in known_mm[i]),
-            )
+            line_n = first_line_n + int(np.flatnonzero(known)[i])
+            place = ", ".join(f"{value:g}" for value in known_mm[i])
             got += f", because the place in line {line_n} ({place} mm) is far from the other places"
             remedy = "Correct that place, or convert its unit to mm."
         raise CaptureError(where, "places", rule, got, remedy)
-
-
-def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
-    """Raise if the greatest depth is too small or too large for a skin, which suggests another unit than mm.
-
-    Unknown depths (NaN) are ignored. Depths that are all 0 are accepted.
-    """
-    deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
-    if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
-        rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm"
-        remedy = "If the unit of the file is m or um, convert the depths to mm."
-        raise CaptureError(where, "the greatest depth", rule, f"{deepest_mm:.4g}", remedy)
-
-
-def check_labels(
-    labels: Mapping[str, Float[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str, *, first_line_n: int
-) -> None:
-    """Raise if places, depths or forces, by the name of their column, are probably not in mm and N.
-
-    Columns may be missing, and values may be unknown (NaN). Also raises if the force Fz is negative in compression.
-    """
-    for axis in ("Fx_N", "Fy_N", "Fz_N"):
-        if axis in labels:
-            check_forces(labels[axis], where, first_line_n=first_line_n)
-    forces = [labels[axis][contact] for axis in ("Fx_N", "Fy_N", "Fz_N") if axis in labels]
-    check_touch(np.array(forces), where)
-    place_mm = np.stack([labels["x_mm"], labels["y_mm"]], axis=1)
-    check_places(np.where(contact[:, None], place_mm, np.nan), where, first_line_n=first_line_n)
-    if "depth_mm" in labels:
-        check_depths(labels["depth_mm"][contact], where)
-    pressed_N = labels["Fz_N"][contact & np.isfinite(labels["Fz_N"])] if "Fz_N" in labels else np.zeros(0)
-    if len(pressed_N) and np.median(pressed_N) < 0:
-        got = f"{np.median(pressed_N):.4g} N"
-        remedy = "Reverse the sign of Fz_N in the file or in the map of columns."
-        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, remedy)
-
-
-def check_log(log: ProbeLog, where: str) -> None:
-    """Check the labels of a probe log; see `check_labels`."""
-    check_labels({name: getattr(log, name) for name in LABELS}, log.contact, where, first_line_n=FIRST_ROW)
 
 
 def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:
@@ -181,10 +143,11 @@ def _refuse_counts(b_uT: Float[np.ndarray, "f ch"], where: str) -> None:
         )
 
 
-def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, line_n: Int[np.ndarray, " f"]) -> None:
+def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, line_n: Int[np.ndarray, " f"] | None) -> None:
     b_max_uT = np.abs(b_uT).max(axis=1)
     if b_max_uT.max() > chips.FULL_SCALE_uT:
-        place = f"line {line_n[b_max_uT.argmax()]}"
+        row_i = int(b_max_uT.argmax())
+        place = f"line {row_i + 1 if line_n is None else line_n[row_i]}"
         rule = f"below the full scale of the chip, {chips.FULL_SCALE_uT:.0f} uT"
         got = f"{b_max_uT.max():.6g} in {place}"
         raise CaptureError(

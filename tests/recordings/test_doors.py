@@ -238,17 +238,17 @@ def test_cut_digits_and_torn_lines_of_logs_are_dropped_and_counted(tmp_path):
 def test_correct_recordings_of_other_chips_are_accepted(step_uT, scale):
     rng = rng_for(0, "chips")
     b_uT = BASE_uT * scale + rng.normal(0, max(20 * step_uT, 0.3), (2000, 15))
-    check_fields(np.rint(b_uT / step_uT) * step_uT, "a.csv", first_line_n=1)
+    check_fields(np.rint(b_uT / step_uT) * step_uT, "a.csv")
 
 
 def test_values_in_other_units_and_raw_counts_are_refused():
     b_uT, _ = readings("units")
     for factor, message in ((1000.0, "nT|full scale"), (1e-3, "earth's field"), (0.01, "earth's field|probably G")):
         with pytest.raises(CaptureError, match=message):
-            check_fields(factor * b_uT, "a.csv", first_line_n=1)
+            check_fields(factor * b_uT, "a.csv")
     counts = np.rint(BASE_uT * 6 + 32768 + rng_for(0, "counts").normal(0, 6, (2000, 15)))
     with pytest.raises(CaptureError, match="raw counts"):
-        check_fields(counts, "a.csv", first_line_n=1)
+        check_fields(counts, "a.csv")
 
 
 @pytest.mark.parametrize("chips_n", [5, 15])

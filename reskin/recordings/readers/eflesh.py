@@ -137,7 +137,7 @@ def _read_files(
             f"{header.capture}/{SENSOR}: time does not increase in line {back[0] + 2}. If the file contains two "
             "recordings, split it into two files."
         )
-    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
+    check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}")
     return sensor, changes[:, 1:], states
 
 

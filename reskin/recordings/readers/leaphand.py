@@ -22,7 +22,7 @@ from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.tables import count_columns, make_readings, only_file, read_rows
-from reskin.recordings.units import check_changes
+from reskin.recordings.units import check_fields
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 READINGS = "readings.txt"
@@ -122,7 +122,7 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     joints = [f"joint {joint + 1}" for joint in range(JOINTS_N * pads_n)]
     numbers = read_rows(folder / READINGS, where, [*fields, *joints])
     b_uT, joint_counts = numbers[:, first : first + CHANNELS_N], numbers[:, len(fields) :]
-    check_changes(b_uT, where, first_line_n=1)
+    check_fields(b_uT, where, subtracted=True)
     wrong = (joint_counts != np.rint(joint_counts)) | (joint_counts < 0) | (joint_counts >= COUNTS_PER_TURN)
     if wrong.any():
         row_i, joint_i = np.argwhere(wrong)[0]

@@ -232,7 +232,7 @@ def test_fields_of_a_public_recording_are_one_row_late(tmp_path: Path, shared_da
 @pytest.mark.parametrize(
     ("columns", "factor", "expected"),
     [
-        (slice(0, 2), 1e-3, "places must be all equal, or spread over a range of 1 to 200 mm; got a range of 0.008"),
+        (slice(0, 2), 1e-3, "places must be all equal, or spread over a range of 1 to 200 mm; got a range of 0.016"),
         (slice(0, 2), 1e3, "convert the places to mm"),
         (slice(2, 3), 0.01, "force must be at least 0.05 N in one or more rows with contact; got 0.015 N at most"),
         (slice(2, 3), 1e3, "convert the forces to N"),
