@@ -4,6 +4,7 @@ A log is a recording of the field over time (`reskin.logs`). The user has to cho
 of the log, because only the number of channels is checked.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -89,7 +90,7 @@ def predict(
         models.zero(quiet_uT, keep=True)
     detector = ContactDetector(quiet_uT, models.suppressor if isinstance(models, Universal) else None)
     summary = LogSummary(step_s(head.device_s), quiet_n, detector.noise_uT)
-    suspects = _Suspects(models) if isinstance(models, Universal) else None
+    doubtful = Counter[str]()
     with io.replacing(out) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(",".join(COLUMNS) + "\n")
         parts = (part for block in chain([head], blocks) for part in block.divide(ESTIMATED_AT_ONCE_N))
@@ -97,11 +98,12 @@ def predict(
             db_uT = detector.change_uT(block.b_uT)
             contact = detector.contact(db_uT)
             targets = _targets(models, db_uT[contact])
-            if suspects is not None:
-                suspects.feed(db_uT[contact], targets[:, 2])
+            if isinstance(models, Universal):
+                doubtful.update(_count_doubtful(models, db_uT[contact], targets[:, 2]))
             summary.feed(block.device_s, contact, targets[None, :, 2])
             file.write(render(block.device_s, contact, targets))
-    return summary.counts() | ({} if suspects is None else suspects.counts()) | account
+    warned = {"model_warnings": models.warnings} if isinstance(models, Universal) else {}
+    return summary.counts() | doubtful | warned | account
 
 
 def _check_channels(b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Network] | Universal, log: Path) -> None:
@@ -143,29 +145,17 @@ def _predict_table(
     }
 
 
-class _Suspects:
-    """Counts of readings in contact whose estimates are doubtful, and the warnings of the model.
-
-    These are the readings whose misfit is above `MISFIT_MAX`, and the readings whose estimated force is at a limit of
-    the model's range.
-    """
-
-    def __init__(self, model: Universal) -> None:
-        self._model = model
-        self._unknown_n = self._at_limit_n = 0
-
-    def feed(self, db_uT: Float32[np.ndarray, "c ch"], force_N: Float[np.ndarray, " c"]) -> None:
-        if len(db_uT):
-            self._unknown_n += int((self._model.misfit(db_uT + self._model.noload_uT) > MISFIT_MAX).sum())
-        lowest_N, highest_N = self._model.layout.force_N
-        self._at_limit_n += int(((force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)).sum())
-
-    def counts(self) -> dict[str, Any]:
-        return {
-            "unknown_skin_readings_n": self._unknown_n,
-            "force_at_limit_readings_n": self._at_limit_n,
-            "model_warnings": self._model.warnings,
-        }
+def _count_doubtful(
+    model: Universal, db_uT: Float32[np.ndarray, "c ch"], force_N: Float[np.ndarray, " c"]
+) -> dict[str, int]:
+    """Count the readings in contact whose misfit is above `MISFIT_MAX`, or whose force is at a limit of the range."""
+    misfit = model.misfit(db_uT + model.noload_uT) if len(db_uT) else np.zeros(0)
+    lowest_N, highest_N = model.layout.force_N
+    at_limit = (force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)
+    return {
+        "unknown_skin_readings_n": int((misfit > MISFIT_MAX).sum()),
+        "force_at_limit_readings_n": int(at_limit.sum()),
+    }
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
@@ -194,7 +184,8 @@ def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Net
     `external_uT` is explained in `load_universal`. It must be 0 for networks.
     """
     made = [file for file in files if is_model(file)]
-    calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
+    others = [file for file in files if file not in made and file.suffix == SUFFIX and file.is_file()]
+    calibrations = [file for file in others if is_skin(file)]
     if not (made or calibrations):
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
@@ -207,15 +198,6 @@ def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Net
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
     calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
     return load_universal(calibration, file=model, external_uT=external_uT)
-
-
-def _is_calibration(file: Path) -> bool:
-    try:
-        return is_skin(file)
-    except SchemaError:
-        if file.suffix == SUFFIX:
-            raise
-        return False  # The error is reported later, by `read_network`.
 
 
 def render(t_s: Float64[np.ndarray, " f"], contact: Bool[np.ndarray, " f"], targets: Float64[np.ndarray, "c 3"]) -> str:
