@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 
+from reskin.seeds import rng_for
+
 LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in rows
 ROWS_MIN_N = 300  # in a shorter recording, a change of the lag cannot be detected
 BLOCK_ROWS_N = 500  # to remove slow drift, the median field of each block of about this many rows is subtracted
@@ -153,7 +155,6 @@ COMPARED_MIN = 0.25
 # be compared for a period, the sample does not exclude this period.
 PROBES_N = 256
 PROBES_MIN_N = 8
-GOLDEN = (np.sqrt(5.0) - 1) / 2  # the golden ratio modulo 1, with which the sample is chosen
 
 
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
@@ -186,9 +187,8 @@ def _likely_periods(
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Choose the moves at multiples of the golden ratio modulo 1, which are spread evenly over the recording. Equally
-    # spaced moves would be worse: on a grid of places, they could all be at the same few places.
-    probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
+    # The sample is random, because equally spaced moves on a grid of places could all be at the same few places.
+    probes = rng_for(0, "moves").permutation(early)[:PROBES_N]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:
         shifts = slice(1, half_n + 1)
