@@ -168,7 +168,8 @@ def _read_labels(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str
     place_mm = np.round(states[:, 1:3], PLACE_DECIMALS)
     place_mm -= place_mm.min(axis=0)
     unknown = np.full(len(z_mm), np.nan)
-    depth_mm = unknown if _holds_height(z_mm) else z_mm.max() - z_mm
+    holds_height = np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_FRACTION * np.abs(z_mm).max()))
+    depth_mm = unknown if holds_height else z_mm.max() - z_mm
     labels = {"x_mm": place_mm[:, 0], "y_mm": place_mm[:, 1], "depth_mm": depth_mm}
     axis = "z"
     if states.shape[1] > WEIGHT_COLUMN:
@@ -180,8 +181,3 @@ def _read_labels(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str
         labels[f"F{axis}_N"] = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
     check_labels(labels, np.ones(len(z_mm), bool), f"{header.capture}/{STATES}", first_line_n=1)
     return labels if axis == "z" else labels | {"depth_mm": unknown}
-
-
-def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:
-    """Return whether the robot kept a constant height; see `HELD_FRACTION`."""
-    return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_FRACTION * np.abs(z_mm).max())))

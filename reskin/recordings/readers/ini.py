@@ -63,7 +63,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     """Count the chips from the number of columns of the readings, which has four columns (X, Y, Z, T) for each chip."""
     where = str(files[READINGS])
     columns_n = count_columns(files[READINGS], where)
-    if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
+    if columns_n % VALUES_PER_CHIP_N:
         raise CaptureError(
             f"{where}: {columns_n} columns cannot be X, Y, Z, T for each chip. Check that the layout is ini."
         )
@@ -76,9 +76,12 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     The no-load field of a pass is the mean field of its corner rows, which are the rows before its first contact.
     """
     given_late_n = _rows_late(header)
-    b_uT, temperature_degC = _read_fields(folder, header)
-    truths = _read_truths(folder, header)
-    _check_rows_n(len(b_uT), len(truths), given_late_n or 0, header)
+    b_uT, temperature_degC, truths = _read_files(folder, header)
+    if len(b_uT) <= (given_late_n or 0):
+        raise CaptureError(
+            f"{header.capture}: the recording has {len(b_uT)} rows, but option rows_late is {given_late_n}. If the "
+            "recording was cut, copy the recording again."
+        )
     rows = check_rows(
         b_uT, temperature_degC, header.expected_lsb_uT, where=f"{header.capture}/{READINGS}", policy=policy
     )
@@ -118,39 +121,27 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     }
 
 
-def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
-    """Read the fields (one column per channel) and the temperatures (one column per chip)."""
-    names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
+def _read_files(
+    folder: Path, header: Header
+) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"], Float64[np.ndarray, "f 3"]]:
+    """Read the fields, the temperatures of the chips in degC, and the truths: x in mm, y in mm and force in N."""
     where = f"{header.capture}/{READINGS}"
+    names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
     numbers = read_rows(folder / READINGS, where, names)
     per_chip = numbers.reshape(len(numbers), header.chips_n, VALUES_PER_CHIP_N)
     b_uT = per_chip[:, :, :3].reshape(len(numbers), -1)
     check_fields(b_uT, where)
-    return b_uT, per_chip[:, :, 3]
-
-
-def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
-    """Read the truths: columns x in mm, y in mm and force in N."""
-    where = f"{header.capture}/{TRUTHS}"
-    names = ["x_mm", "y_mm", "Fz_N"]
+    where, names = f"{header.capture}/{TRUTHS}", ["x_mm", "y_mm", "Fz_N"]
     truths = read_rows(folder / TRUTHS, where, names)
     # In kg or kN, all forces are below CONTACT_MIN_N, so each force above 0 is checked.
     check_labels(dict(zip(names, truths.T, strict=True)), truths[:, 2] > 0, where, first_line_n=1)
-    return truths
-
-
-def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
-    if readings_n <= rows_late_n:
-        raise CaptureError(
-            f"{header.capture}: the recording has {readings_n} rows, but option rows_late is {rows_late_n}. If the "
-            "recording was cut, copy the recording again."
-        )
-    if readings_n != truths_n:
-        got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
+    if len(b_uT) != len(truths):
+        got = f"{len(b_uT)} in {READINGS} and {len(truths)} in {TRUTHS}"
         raise CaptureError(
             f"{header.capture}: the two files have different numbers of rows, {got}. Use the truths file of the same "
             "recording."
         )
+    return b_uT, per_chip[:, :, 3], truths
 
 
 def _rows_late(header: Header) -> int | None:
