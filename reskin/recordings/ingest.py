@@ -2,7 +2,8 @@
 
 A native capture consists of the stream of bytes that a board sent, and of the probe log of the rig. The probe log lists
 the dwells: the times in which the rig did not move. Stream and probe log have different clocks. Therefore, the clocks
-are first aligned. Then each frame of the stream is assigned to the dwell in which it was measured.
+are first aligned. Then each frame of the stream is assigned to the dwell in which it was measured. The no-load
+reading is stored beside each raw reading, and is subtracted only where readings are used; see `reskin.data.baseline`.
 """
 
 from collections import Counter

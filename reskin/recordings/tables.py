@@ -1,6 +1,7 @@
 """Read and write tables; errors name the line and column.
 
-`TableFile` reads tables of any program; `parse_csv` reads CSV files whose columns and types are known.
+`TableFile` reads tables of any program; `parse_csv` reads CSV files whose columns and types are known. The docstring of
+`reskin.recordings.readers` says which module reads which table or log.
 """
 
 import csv
@@ -26,7 +27,6 @@ from reskin.errors import CaptureError, did_you_mean
 from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
-COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or correct it."
 NUMBER_PATTERN = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 GZIP_MARK = b"\x1f\x8b"
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -198,7 +198,8 @@ class TableFile:
         except UNREADABLE as error:
             problem = ascii(" ".join(str(error).split()))[1:-1][:120]
             if match := COLUMNS_N.search(problem):
-                problem, remedy = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}", COPY_AGAIN
+                problem = f"line {match[1]} has {match[3]} columns, but line 1 has {match[2]}"
+                remedy = "The file may have been cut or edited. Copy the file again, or correct it."
             else:
                 problem, remedy = f"the file cannot be read as a table: {problem}", "Check the file."
             raise CaptureError(f"{self._where}: {problem}. {remedy}") from None
@@ -466,33 +467,6 @@ def count_chips_of(names: list[str]) -> int:
     """
     numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"(?:T|Bx|By|Bz)(\d{1,3})", name))]
     return max(numbers, default=0) + 1
-
-
-def check_columns(names: list[str], wanted: list[str], where: str, *, layout: str) -> None:
-    """Raise if one of the wanted columns is missing."""
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        if renamed := _renaming(names, wanted):
-            raise CaptureError(f"{where}: no column {', '.join(missing)}. {renamed}")
-        raise CaptureError(
-            f"{where}: no column {', '.join(missing)}. Check that the layout is {layout}, and that line 1 has the "
-            "column names. See data/README.md. If the values have other names or units, describe them in a file for "
-            "option --columns (docs/add-your-data.md)."
-        )
-
-
-def _renaming(names: list[str], wanted: list[str]) -> str:
-    """Return a sentence on other habits of naming: other capitals, or chips that are numbered from 1; else empty."""
-    lower = {name.lower(): name for name in names}
-    if all(name.lower() in lower for name in wanted):
-        found = [f"{lower[name.lower()]} to {name}" for name in wanted if name not in names]
-        return f"Rename {', '.join(found)}."
-    if "Bx0" not in names and {"Bx1", "By1", "Bz1"} <= set(names):
-        return (
-            "The chips seem to be numbered from 1. Number them from 0, or state it in a file for option --columns: "
-            'fields: {Bx: "Bx{}", By: "By{}", Bz: "Bz{}", first: 1} (docs/add-your-data.md).'
-        )
-    return ""
 
 
 def contact_rows(phases: pa.ChunkedArray, where: str) -> Bool[np.ndarray, " f"]:

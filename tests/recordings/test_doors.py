@@ -19,7 +19,8 @@ from reskin.live.health import Health
 from reskin.logs import quiet_start
 from reskin.recordings.fault_policy import STANDARD_POLICY, FaultLog
 from reskin.recordings.readers import sd_card
-from reskin.recordings.tables import TableFile, check_columns
+from reskin.recordings.readers.table import check_columns
+from reskin.recordings.tables import TableFile
 from reskin.recordings.units import check_fields
 from reskin.seeds import rng_for
 
@@ -281,7 +282,7 @@ def test_noise_alone_is_not_taken_for_a_touch_but_presses_are_found(rate_hz, chi
 )
 def test_renamings_are_proposed(names, remedy):
     with pytest.raises(CaptureError, match=remedy):
-        check_columns(names, ["phase", "x_mm", "Bx0", "By0", "Bz0"], "here", layout="table")
+        check_columns(names, ["phase", "x_mm", "Bx0", "By0", "Bz0"], "here")
 
 
 @pytest.mark.parametrize(

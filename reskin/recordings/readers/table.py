@@ -15,7 +15,6 @@ from reskin.recordings.readers.alignment import find_passes
 from reskin.recordings.tables import (
     FIRST_ROW,
     TableFile,
-    check_columns,
     contact_rows,
     count_chips_of,
     count_within,
@@ -85,7 +84,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     file = TableFile(folder / name, where)
     chips_n = count_chips_of(file.names)
     columns = columns_of(chips_n)
-    check_columns(file.names, columns[: len(NEEDED) + 3 * chips_n], where, layout="table")
+    check_columns(file.names, columns[: len(NEEDED) + 3 * chips_n], where)
     _refuse_near_names(file.names, columns, where)
     known = [column for column in columns[1:] if column in file.names]
     readings, account = to_readings(check_table(file.read(known, ["phase"]), header, policy, where), header)
@@ -160,6 +159,30 @@ def to_readings(rows: Rows, header: Header) -> tuple[Readings, Account]:
         "passes_n": len(np.unique(readings.pass_i)),
         "no_depth_rows_n": len(readings) if depth_is_zero or "depth_mm" not in numbers else 0,
     }
+
+
+def check_columns(names: Sequence[str], wanted: Sequence[str], where: str) -> None:
+    """Raise if one of the wanted columns is missing; suggest a remedy for other habits of naming.
+
+    These are other capitals, and chips that are numbered from 1.
+    """
+    missing = [name for name in wanted if name not in names]
+    if not missing:
+        return
+    lower = {name.lower(): name for name in names}
+    if all(name.lower() in lower for name in wanted):
+        remedy = f"Rename {', '.join(f'{lower[name.lower()]} to {name}' for name in missing)}."
+    elif "Bx0" not in names and {"Bx1", "By1", "Bz1"} <= set(names):
+        remedy = (
+            "The chips seem to be numbered from 1. Number them from 0, or state it in a file for option --columns: "
+            'fields: {Bx: "Bx{}", By: "By{}", Bz: "Bz{}", first: 1} (docs/add-your-data.md).'
+        )
+    else:
+        remedy = (
+            "Check that the layout is table, and that line 1 has the column names. See data/README.md. If the values "
+            "have other names or units, describe them in a file for option --columns (docs/add-your-data.md)."
+        )
+    raise CaptureError(f"{where}: no column {', '.join(missing)}. {remedy}")
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
