@@ -5,8 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.manage.add import ORIENTATIONS, Presses, other_orientation, presses_of
+from pipeline.manage.add import COMPARED_PRESSES_MAX_N, ORIENTATIONS, Presses, other_orientation, presses_of
 from reskin.recordings.readers import lab
+from reskin.recordings.tables import make_readings
 from reskin.seeds import rng_for
 from tests.fields import fields_uT
 from tests.recordings.headers import DEFAULT_POLICY, make_header
@@ -61,3 +62,15 @@ def test_each_wrong_orientation_of_labels_is_found_on_recorded_boards(shared_dat
         assert other_orientation(boards[new], boards[other]) is None
         for way in DEPARTURES:
             assert other_orientation(relabel(boards[new], way), boards[other]) == inverse_of(way)
+
+
+@pytest.mark.parametrize(("place_mm", "compared_n"), [(2.0, COMPARED_PRESSES_MAX_N), (np.nan, 0)])
+def test_long_capture_is_thinned_and_presses_without_a_place_are_left_out(place_mm, compared_n):
+    """The comparison of 20000 presses with 20000 others would need several GB of memory."""
+    n = 3 * COMPARED_PRESSES_MAX_N
+    fields = np.ones((n, 15))
+    readings = make_readings(
+        make_header(chips_n=5), np.ones(n, bool), indentation=np.arange(n), pass_i=np.zeros(n),
+        x_mm=np.full(n, place_mm), y_mm=np.full(n, place_mm), b_uT=2 * fields, noload_uT=fields, n_contacts=np.zeros(n),
+    )  # fmt: skip
+    assert len(presses_of([readings]).place_mm) == compared_n

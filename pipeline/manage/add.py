@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64
 
 from pipeline import PARAMS, PLAN, SCENES
 from pipeline.catalogue import EXPERIMENTS
+from pipeline.fitting.presses import pool, thin
 from pipeline.manage.registry import (
     RAW,
     REGISTRY,
@@ -32,7 +33,7 @@ from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
 from reskin.board.rates import REPEATED_MAX, RepeatCounter
-from reskin.errors import CaptureError, ParamsError, ReskinError, did_you_mean
+from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError, did_you_mean
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
@@ -45,7 +46,9 @@ PLACES_MIN_N, SPAN_MIN = 9, 0.2
 # Readings minus a no-load reading, both only noise, have the rms of the steps between readings, or less.
 SIGNAL_STEPS_MIN = 1.05
 COMPARED_N = 3  # the places of a new capture are compared with those of this number of the scene's latest captures
-COMPARED_PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
+# With fewer presses, no orientation is reported. More presses are thinned out, because each is compared with each press
+# of another capture.
+COMPARED_PRESSES_MIN_N, COMPARED_PRESSES_MAX_N = 20, 1000
 # Another orientation of the labels is reported if it explains at least the fraction EXPLAINED_MIN of the variance of
 # the estimated places, and if this fraction exceeds that of the unchanged labels by at least GAIN_MIN.
 EXPLAINED_MIN = GAIN_MIN = 0.5
@@ -308,21 +311,16 @@ class Presses:
 
 
 def presses_of(blocks: Iterable[Readings]) -> Presses:
-    """Return the presses of a capture that have a known place; the readings of a press are averaged."""
-    place_mm, change_uT = [], []
-    for block in blocks:
-        known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
-        for press in np.unique(block.indentation[known]):
-            rows = known & (block.indentation == press)
-            place_mm.append([block.x_mm[rows][0], block.y_mm[rows][0]])
-            change_uT.append((block.b_uT[rows].astype(float) - block.noload_uT[rows]).mean(axis=0))
-    if not place_mm:
+    """Return at most `COMPARED_PRESSES_MAX_N` presses of a capture that have a known place."""
+    try:
+        presses = thin(pool(list(blocks), with_force=False), COMPARED_PRESSES_MAX_N)
+    except SchemaError:  # no press has a known place
         return Presses(np.zeros((0, 2)), np.zeros((0, 0)))
-    places, changes = np.array(place_mm, float), np.array(change_uT)
-    magnitude_uT = np.linalg.norm(changes, axis=1)
+    places, changes_uT = presses.place_mm, presses.db_uT.reshape(len(presses), -1)
+    magnitude_uT = np.linalg.norm(changes_uT, axis=1)
     sound = np.isfinite(magnitude_uT) & (magnitude_uT > 0)
     middle_mm = (places[sound].max(axis=0) + places[sound].min(axis=0)) / 2 if sound.any() else 0.0
-    return Presses(places[sound] - middle_mm, changes[sound] / magnitude_uT[sound, None])
+    return Presses(places[sound] - middle_mm, changes_uT[sound] / magnitude_uT[sound, None])
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
