@@ -18,7 +18,6 @@ from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.labels import LabelSource
 from reskin.recordings.preparing import CaptureNames, native
 from reskin.recordings.recorder import (
-    NO_INFO,
     CaptureInfo,
     PortSettings,
     _label_context,
@@ -126,7 +125,7 @@ def test_error_of_a_label_source_ends_the_recording(terminal, tmp_path):
 
 
 def test_marks_set_after_the_label_file_was_closed_are_not_written_to_the_header(tmp_path):
-    part, header = begin_capture(tmp_path / "run1", NO_INFO, wire="binary", chips_n=5, by="a test")
+    part, header = begin_capture(tmp_path / "run1", CaptureInfo(), wire="binary", chips_n=5, by="a test")
     headers = [header]
     context = _label_context(part, headers, threading.Event())
     context.mark(5.0, 6.0)
@@ -139,7 +138,7 @@ def test_marks_set_after_the_label_file_was_closed_are_not_written_to_the_header
 
 def test_folder_that_cannot_be_created_is_an_error():
     with pytest.raises(SchemaError, match="^/proc/nowhere: cannot create"):
-        begin_capture(Path("/proc/nowhere/run1"), NO_INFO, wire="binary", chips_n=5, by="a test")
+        begin_capture(Path("/proc/nowhere/run1"), CaptureInfo(), wire="binary", chips_n=5, by="a test")
 
 
 def test_existing_folder_is_not_overwritten(tmp_path):

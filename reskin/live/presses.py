@@ -4,7 +4,6 @@
 """
 
 import re
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -15,7 +14,7 @@ from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates
 from reskin.recordings.header import Clock, Source, write_header
 from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
-from reskin.recordings.recorder import NO_INFO, CaptureWriter, begin_capture, end_capture, new_folder
+from reskin.recordings.recorder import CaptureInfo, CaptureWriter, begin_capture, end_capture, new_folder
 from reskin.seeds import rng_for
 from reskin.universal.layout import BoardLayout, paper_layout
 
@@ -183,7 +182,7 @@ class PageRecording:
             port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
             self.folder = self.folder.with_name(f"{self.folder.name}-{port}")
         self._part, self._header = begin_capture(
-            self.folder, replace(NO_INFO, source=source), wire=board.wire, chips_n=board.chips_n, by="reskin live"
+            self.folder, CaptureInfo(source=source), wire=board.wire, chips_n=board.chips_n, by="reskin live"
         )
         self._reader = reader
         self._labels: ProbeLogWriter | None = None

@@ -7,7 +7,6 @@ force gauge, or from a program.
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +25,7 @@ from reskin.recordings.labels import (
     from_table,
     parse_places,
 )
-from reskin.recordings.recorder import NO_INFO, PortSettings, new_folder, print_progress, record_capture
+from reskin.recordings.recorder import CaptureInfo, PortSettings, new_folder, print_progress, record_capture
 from reskin.seeds import rng_for
 
 GAUGE_BAUD = 9600
@@ -95,7 +94,7 @@ def record_board(
     folder, health = folder or new_folder(), Health(board.chips_n)
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
     stated: dict[str, Any] = scan | dict(names or {})
-    info = replace(NO_INFO, **stated, labels=labels, source=source)
+    info = CaptureInfo(**stated, labels=labels, source=source)
     settings = PortSettings(baud, board.wire, board.chips_n, seconds, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S)
     stream, labels_summary, error = record_capture(
         board.port, folder, info=info, settings=settings,

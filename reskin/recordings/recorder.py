@@ -66,14 +66,11 @@ class PortSettings:
 class CaptureInfo:
     """What a recorder must know about a capture: the names for its header, and the source of its labels."""
 
-    board: str
-    skin: str
-    scan: str  # order of the places: random, snake or other text
+    board: str = UNNAMED
+    skin: str = UNNAMED
+    scan: str = "not stated"  # order of the places: random, snake or other text
     labels: LabelSource | None = None
     source: Source = "recorded"  # "simulated" if the port is an emulated board that sends a simulation
-
-
-NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 
 
 @dataclass(frozen=True)

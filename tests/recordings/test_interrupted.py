@@ -110,7 +110,9 @@ def test_recording_of_which_a_file_is_missing_is_refused(tmp_path, name):
 def test_header_and_renames_are_on_the_disk_before_the_recorder_goes_on(tmp_path, monkeypatch):
     steps: list[str] = []
     monkeypatch.setattr(io, "sync", lambda *paths: steps.extend(sorted(path.name for path in paths)))
-    part, header = recorder.begin_capture(tmp_path / "run1", recorder.NO_INFO, wire="binary", chips_n=5, by="a test")
+    part, header = recorder.begin_capture(
+        tmp_path / "run1", recorder.CaptureInfo(), wire="binary", chips_n=5, by="a test"
+    )
     assert steps[1:] == ["run1.part", tmp_path.name]  # the header under its temporary name, then both folders
     steps.clear()
     with recorder.CaptureWriter(part, "binary", 5) as writer:
