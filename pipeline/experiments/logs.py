@@ -1,7 +1,6 @@
 """Logs: force and place over time from a log on an SD card, such as a log of a dog shoe or a glove (paper section 6).
 
-Networks that were trained without the log's board estimate the contacts in the log. A simulated log is also scored,
-both as it is and as if its board rotated in the earth's field.
+Networks that were trained without the log's board estimate the contacts in the log. A simulated log is also scored.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,27 +10,19 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
-from scipy.constants import micro
-from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.results import only, write_results
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
-from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from reskin.logs import ContactDetector, LogSummary, contacts_n, quiet_start, step_s
 from reskin.metrics import score
 from reskin.models.trained import networks_held_out
-from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, Instrument, draw_instrument, readings_uT, reference_uT
 from reskin.recordings import probe
 from reskin.recordings.header import LOG_FILE, PROBE_FILE
 from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
-from reskin.seeds import rng_for
 
-PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of a shoe's pitch angle during a step
-PERIOD_S = 1.0  # assumed period of the steps for a log with fewer than two contacts
-SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 POINTS_MAX_N = 1500  # largest number of points that a curve in a figure has
 
 # A network: a function that estimates x_mm, y_mm and F_N from field changes in uT.
@@ -45,8 +36,7 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
     """
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
-    board = read_header(folder).board
-    networks = networks_held_out(models, board)
+    networks = networks_held_out(models, read_header(folder).board)
     quiet_n = quiet_start(t_s, b_uT, where=str(folder / LOG_FILE))
     estimated = estimate(quiet_n, t_s, b_uT, networks)
     numbers, true = describe(estimated) | {"networks_n": len(networks), "account": account}, None
@@ -56,7 +46,6 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
         numbers |= score_contacts(estimated, true)
-        numbers |= score_turning(Log(t_s, b_uT, true, quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
     write_results(results, numbers, thin(estimated, true), losses)
     say(f"{settings.scene}: {numbers['contacts_n']} contacts found in a log of {numbers['duration_s']:.1f} s")
@@ -169,80 +158,6 @@ def _columns(rows: Float64[np.ndarray, "f 3"]) -> dict[str, list[float | None]]:
         name: [None if np.isnan(value) else round(float(value), 2) for value in column]
         for name, column in zip(names, rows.T, strict=True)
     }
-
-
-# --- A board that rotates in the earth's field ---
-
-
-@dataclass(frozen=True)
-class Log:
-    """A log of a board that does not rotate, with its true contacts."""
-
-    t_s: Float64[np.ndarray, " f"]
-    b_uT: Float32[np.ndarray, "f ch"]
-    true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N; NaN without contact
-    quiet_n: int  # number of rows without contact at the start of the log
-
-
-def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
-    """Score the networks on the log as if its board rotated in the earth's field, without and with a reference chip."""
-    simulation, seed = simulation_settings(settings), settings.seed
-    design = simulation.main_boards.design
-    instrument = draw_instrument(design, simulation.spreads, simulation.chip, seed=seed, name=board)
-    return {
-        "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),
-        "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),
-        "earth_uT": EARTH_SIZE_T / micro,
-    }
-
-
-def score_pitches(
-    log: Log, instrument: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
-) -> list[dict[str, Any]]:
-    """Score the networks on a log whose board pitches in the earth's field after the quiet start.
-
-    Returns one row per amplitude in `PITCHES_DEG`. A row contains the scores as logged and, under `reference_chip`, the
-    scores after the reading of a reference chip was subtracted. `instrument.noise_uT` is the noise of one reading of
-    that chip.
-    """
-    period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
-    rows = []
-    for pitch_deg in PITCHES_DEG:
-        swing_rad = np.radians(pitch_deg) * swing(log.t_s, start_s=float(log.t_s[log.quiet_n - 1]), period_s=period_s)
-        field_T = earth_in_board_T(swing_rad)
-        added_uT = readings_uT(instrument.board, np.repeat(field_T[:, None], len(instrument.turn), axis=1))
-        corrected_uT = added_uT - reference_uT(instrument, field_T, rng)
-        rows.append(
-            {"pitch_deg": pitch_deg} | _score(log, added_uT, networks)
-            | {"reference_chip": _score(log, corrected_uT, networks)}
-        )  # fmt: skip
-    return rows
-
-
-def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
-    """Return the median time between the starts of successive contacts; `PERIOD_S` if there are fewer than two."""
-    starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
-    return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
-
-
-def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
-    """Return a sine of amplitude 1 that begins at `start_s`, and 0 before that time."""
-    return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
-
-
-def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
-    """Return the earth's field in the axes of a board that pitches about its y axis.
-
-    At a pitch of 0, the board's x axis points north. This direction is the worst case, because the x axis then moves in
-    the plane that contains the whole field.
-    """
-    return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
-
-
-def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Estimator]) -> dict[str, Any]:
-    estimated = estimate(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
-    scores = score_contacts(estimated, log.true)
-    return {"contacts_n": contacts_n(estimated.contact)} | {name: scores[name] for name in SCORES if name in scores}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

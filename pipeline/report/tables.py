@@ -41,11 +41,9 @@ SHEAR = {
 }  # fmt: skip
 ADAPTATION = ("before", "after", "control", "grid")
 SLEEVE = COLUMNS | {"median_error_mm": "median error, mm", "p95_error_mm": "95 % of errors below, mm"}
-TURNING = {
+LOGS = {
     "contacts_true_n": "true contacts", "contacts_n": "contacts found", "false_readings_n": "false readings",
     "missed_readings_n": "missed readings", "mse_f_N2": "MSE_F, N²", "accuracy_pct": "within 1 mm, %",
-}  # fmt: skip
-LOGS = TURNING | {
     "mse_xy_mm2": "MSE_xy, mm²", "contact_readings_n": "readings in contact",
     "missed_force_max_N": "largest force of a missed reading, N", "force_max_N": "largest estimated force, N",
     "force_true_max_N": "largest true force, N",
@@ -419,18 +417,6 @@ def logs(numbers: Numbers) -> pd.DataFrame:
         ("frames missing from gaps between times", str(account["gap_frames_n"]), None),
         *((title, _of_log(found, name), None) for name, title in LOGS.items() if name in found),
     ])  # fmt: skip
-
-
-@of("logs")
-def logs_turning(numbers: Numbers) -> pd.DataFrame:
-    """The same log, as if the board pitched in the earth's field."""
-    found = numbers["logs"]
-    return pd.DataFrame(
-        {"pitch, °": f"± {row['pitch_deg']:g}", "readings": readings}
-        | {title: _of_log(found | scores, name) for name, title in TURNING.items() if name in found | scores}
-        for row in found.get("turning", ())
-        for readings, scores in (("as logged", row), ("reference chip subtracted", row["reference_chip"]))
-    )
 
 
 def _of_log(row: Numbers, name: str) -> str:

@@ -1,29 +1,18 @@
-"""Tests of estimates from logs, which are long recordings without labels.
-
-Other tests simulate a board that is tilted (pitched) in the earth's field.
-"""
+"""Tests of estimates from logs, which are long recordings without labels."""
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import norm
 
 from pipeline.experiments.logs import (
-    PITCHES_DEG,
-    Log,
     describe,
-    earth_in_board_T,
     estimate,
     score_contacts,
-    score_pitches,
     thin,
     truth_at,
 )
 from reskin.errors import CaptureError
-from reskin.logs import FALSE_SHARE, QUIET_MIN_S, START_WINDOWS_N, WINDOW_S, contacts_n, quiet_start
-from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, Instrument
-from reskin.physics.board import Board
+from reskin.logs import FALSE_SHARE, QUIET_MIN_S, START_WINDOWS_N, WINDOW_S, quiet_start
 from reskin.seeds import rng_for
 
 RATE_HZ = 250.0
@@ -135,69 +124,3 @@ def test_true_values_of_a_reading_are_those_of_the_step_at_its_time():
     true = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     found = truth_at(np.array([0.0, 1.5, 2.5, 3.5, 9.0]), np.array([1.0, 3.0]), np.array([2.0, 4.0]), true)
     np.testing.assert_array_equal(found, [[np.nan] * 3, true[0], [np.nan] * 3, true[1], [np.nan] * 3])
-
-
-def plain_board(name, chips_n):
-    """Return a board whose chips are exact and not rotated."""
-    eyes = np.tile(np.eye(3), (chips_n, 1, 1))
-    return Board(name, np.zeros((chips_n, 3)), eyes, eyes, np.zeros((chips_n, 3)))
-
-
-def instrument(noise_uT=0.0):
-    board = plain_board("b0", 5)
-    return Instrument(board, plain_board("aside", 1), board.turn, np.full(3, noise_uT))
-
-
-def pitched_log(noise_uT=0.0):
-    t_s, b_uT, force_N = make_log()
-    quiet_n = quiet_start(t_s, b_uT, where="log")
-    log = Log(t_s, b_uT, truth(force_N), quiet_n)
-    return log, score_pitches(log, instrument(noise_uT), [predict], rng_for(0, "aside"))
-
-
-def test_pitched_board_reads_the_earth_field_in_rotated_axes():
-    np.testing.assert_allclose(earth_in_board_T(np.array([0.0])), EARTH_T[None])
-    # If the pitch equals the dip of the earth's field, the x axis of the board is parallel to the field.
-    along_T = earth_in_board_T(np.radians([EARTH_DIP_DEG]))
-    np.testing.assert_allclose(along_T, [[EARTH_SIZE_T, 0, 0]], atol=1e-18)
-
-
-@given(st.floats(-1.5, 1.5))
-def test_length_of_the_change_of_the_earth_field_equals_the_chord_of_the_rotation(pitch_rad):
-    rotated_T = earth_in_board_T(np.array([pitch_rad]))[0]
-    assert np.linalg.norm(rotated_T) == pytest.approx(EARTH_SIZE_T)
-    chord_T = 2 * EARTH_SIZE_T * np.sin(abs(pitch_rad) / 2)
-    # The tolerance is the rounding error of fields of 50 uT.
-    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)
-
-
-def test_scores_at_pitch_zero_equal_the_scores_of_the_log():
-    log, rows = pitched_log()
-    found = estimate_log(log.t_s, log.b_uT, [predict])
-    level = rows[0]
-    assert level["pitch_deg"] == 0
-    assert level["contacts_n"] == contacts_n(found.contact) == 4
-    scores = score_contacts(found, log.true)
-    assert level["false_readings_n"] == scores["false_readings_n"] == 0
-    # The tolerance allows for the rounding of 1000 uT to single precision, which is 6e-5 uT.
-    assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)
-
-
-def test_reference_chip_removes_the_false_contacts_caused_by_pitch():
-    log, rows = pitched_log()
-    assert [row["pitch_deg"] for row in rows] == list(PITCHES_DEG)
-    false_n = [row["false_readings_n"] for row in rows]
-    assert false_n == sorted(false_n)
-    # At 45 degrees, the norm of the field changes of five chips oscillates between 0 and sqrt(5) 38 uT = 86 uT. This
-    # norm is below the contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
-    off_n = int((np.isnan(log.true[:, 2]) & (np.arange(len(log.t_s)) >= log.quiet_n)).sum())
-    assert 0.6 * off_n < false_n[-1] < off_n
-    for row in rows:
-        assert row["reference_chip"] == {name: rows[0]["reference_chip"][name] for name in row["reference_chip"]}
-        assert row["reference_chip"]["false_readings_n"] == 0
-
-
-def test_noise_of_the_reference_chip_increases_the_force_error():
-    rows = pitched_log(noise_uT=3.0)[1]
-    assert all(row["reference_chip"]["mse_f_N2"] > 1.5 * rows[0]["mse_f_N2"] for row in rows)
-    assert all(row["reference_chip"]["contacts_n"] == 4 for row in rows)
