@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from reskin import io
 from reskin.code import ROOT, files_of, normalised
@@ -102,29 +101,6 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in COMPUTING}
 
 
-def clear_cost(folder: Path, stage: str) -> None:
-    """Delete the times of training runs that the last run of a stage recorded."""
-    io.remove(_trainings_file(folder, stage))
-
-
-def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
-    """Add training runs to the record of the current run of a stage.
-
-    trained: maps the key of a training run to its duration in seconds, and to whether its result is from an earlier
-    run. waited_s: how long the stage waited for these training runs.
-    """
-    recorded = _read_trainings(folder, stage)
-    reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(recorded["computed_s"])
-    io.write_json(
-        _trainings_file(folder, stage),
-        {
-            "waited_s": recorded["waited_s"] + waited_s,
-            "computed_s": recorded["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
-            "reused": sorted({*recorded["reused"], *reused}),
-        },
-    )
-
-
 def record_cost(folder: Path, stage: str, seconds: float) -> None:
     """Write the cost of a stage to `folder`, which is not an output of the stage, because equal runs differ in cost.
 
@@ -132,52 +108,17 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
     """
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
-    trained = _read_trainings(folder, stage)
-    computed_s = trained["computed_s"]
-    fresh_s = sum(seconds for key, seconds in computed_s.items() if key not in trained["reused"])
-    io.write_json(
-        folder / f"{stage}.json",
-        {
-            "seconds": round(seconds, 2),
-            # Time of the stage without training runs. If training runs are parallel, the stage waits less than the sum
-            # of their times. If it waits longer than the sum, for example for the imports of workers, the excess counts
-            # as other time.
-            "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
-            "trainings_s": computed_s,
-            "reused_n": len(trained["reused"]),
-            "cpu_s": round(
-                sum(usage.ru_utime + usage.ru_stime for usage in usages), 2
-            ),  # includes the CPU time of imports
-            "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
-        },
-    )
-    io.remove(_trainings_file(folder, stage))
+    cost = {
+        "seconds": round(seconds, 2),
+        "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # includes the imports
+        "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
+    }
+    io.write_json(folder / f"{stage}.json", cost)
 
 
-def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
-    """Read the costs of the stages that ran here, by stage; files of an older format are skipped."""
-    costs = {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
-    return {stage: cost for stage, cost in costs.items() if "trainings_s" in cost}
-
-
-def total_cost_s(costs: Iterable[Mapping[str, Any]]) -> float:
-    """Return the total cost of stages in seconds; a training run that two stages share counts once.
-
-    Times of training runs are added as if they ran one after another; the elapsed time is shorter if they run in
-    parallel.
-    """
-    stages = list(costs)
-    trainings_s = {key: seconds for cost in stages for key, seconds in cost["trainings_s"].items()}
-    return float(sum(cost["other_s"] for cost in stages) + sum(trainings_s.values()))
-
-
-def _trainings_file(folder: Path, stage: str) -> Path:
-    return folder / "running" / f"{stage}.json"
-
-
-def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
-    file = _trainings_file(folder, stage)
-    return io.read_json(file) if file.exists() else {"waited_s": 0.0, "computed_s": {}, "reused": []}
+def read_costs(folder: Path) -> dict[str, dict[str, float]]:
+    """Read the costs of the stages that ran here, by stage."""
+    return {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
 
 
 def _git(*arguments: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
-from pipeline.provenance import COSTS, clear_cost, record_cost
+from pipeline.provenance import COSTS, record_cost
 from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
@@ -37,7 +37,6 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> str:
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
-            clear_cost(costs, unit)
             if "settings" in kinds:
                 options["settings"] = read_settings(scene)
             if model := section_of(function):

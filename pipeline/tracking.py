@@ -28,11 +28,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.provenance import COSTS, home, is_experiment, read_costs
+from pipeline.provenance import home, is_experiment
 from pipeline.scenes import TABLE_2
 from pipeline.stage import say
+from pipeline.training.jobs import CACHE
 from reskin import io
-from reskin.errors import ReskinError
+from reskin.errors import ReskinError, SchemaError
 from reskin.metrics import METRICS
 from reskin.models.recipe import HEADLINE
 from reskin.models.trained import SUFFIX
@@ -141,7 +142,6 @@ def publish(scene: str, *, reported: bool = True) -> str:
 
 def read_trainings(scene: str) -> Iterator[Run]:
     """Read the training runs of a scene from the model cards of its stages."""
-    durations_s = {key: s for cost in read_costs(COSTS / scene).values() for key, s in cost["trainings_s"].items()}
     for file in sorted(Path(f"data/models/{scene}").glob("*/*.json")):
         card = io.read_json(file)
         if "recipe_name" not in card:
@@ -162,9 +162,18 @@ def read_trainings(scene: str) -> Iterator[Run]:
             metrics={name: scores[name] for name in METRICS if name in scores},
             curve=tuple(zip(card["curve_steps"], card["curve"], strict=True)),
             files=(file, file.with_suffix(SUFFIX)),
-            seconds=durations_s.get(card["key"]),
+            seconds=_duration_s(card["key"]),
             registered_as=f"reskin-{scene}" if final and not is_experiment() else None,
         )
+
+
+def _duration_s(key: str) -> float | None:
+    """Return the duration of a training from its result in the cache; None if the result is deleted or damaged."""
+    try:
+        metadata = io.read_tensors(home() / CACHE / f"{key}{SUFFIX}", ("curve",))[1]
+    except SchemaError:
+        return None
+    return float(metadata["seconds"])
 
 
 def read_means(scene: str, trainings: list[Run]) -> Iterator[Run]:

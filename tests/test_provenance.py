@@ -5,15 +5,12 @@ import pytest
 
 from pipeline import provenance
 from pipeline.provenance import (
-    clear_cost,
     code_version_of,
     home,
     is_experiment,
     processor_name,
     read_costs,
     record_cost,
-    record_trainings,
-    total_cost_s,
 )
 from reskin import code
 from reskin.numerics import VARIABLES
@@ -70,38 +67,12 @@ def test_variables_that_change_the_results_are_listed_with_the_processor(name):
     assert f"{name}=x" in processor_name(XEON, {name: "x"}, otherwise="")
 
 
-def test_cost_of_a_stage_includes_training_runs_that_were_reused(tmp_path):
-    clear_cost(tmp_path, "train")
-    record_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
-    record_cost(tmp_path, "train", 12.0)
-    first = read_costs(tmp_path)["train"]
-    assert first["seconds"] == 12.0
-    assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # Apart from the training, the stage took 2 s.
-
-    clear_cost(tmp_path, "train")
-    record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
-    record_cost(tmp_path, "train", 2.5)
-    again = read_costs(tmp_path)["train"]
-    assert (again["seconds"], again["reused_n"]) == (2.5, 2)
-    assert total_cost_s([again]) == 8.0 + 9.0 + 2.5
-
-
-def test_training_run_used_by_two_stages_is_counted_once(tmp_path):
-    for stage in ("one", "other"):
-        clear_cost(tmp_path, stage)
-        record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
-        record_cost(tmp_path, stage, 3.0)
-    # The second stage only reuses the training run, so it adds its 3 s.
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0
-
-
-def test_costs_of_a_killed_run_are_dropped(tmp_path):
-    clear_cost(tmp_path, "train")
-    record_trainings(tmp_path, "train", {"old": (8.0, False)}, waited_s=1.0)
-    clear_cost(tmp_path, "train")  # The stage was killed, and starts again.
-    record_cost(tmp_path, "train", 2.0)
-    assert read_costs(tmp_path)["train"]["trainings_s"] == {}
+def test_cost_is_that_of_the_last_run_of_a_stage(tmp_path):
+    for seconds in (12.0, 2.5):
+        record_cost(tmp_path, "train", seconds)
+    cost = read_costs(tmp_path)["train"]
+    assert cost["seconds"] == 2.5
+    assert cost["cpu_s"] > 0 < cost["peak_process_memory_MB"]
 
 
 def test_dvc_experiments_use_the_caches_of_the_checkout(tmp_path, monkeypatch):

@@ -271,22 +271,6 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
     return by_protocol
 
 
-def stage_costs(costs: Mapping[str, Row]) -> dict[str, dict[str, float]]:
-    """Return, for each stage, the cost of computing it from scratch, and the cost of its last run.
-
-    The last run may have reused training runs.
-    """
-    kept = ("seconds", "cpu_s", "reused_n", "peak_process_memory_MB")
-    return {
-        stage: {
-            "computed_s": cost["other_s"] + sum(cost["trainings_s"].values()),
-            "trainings_n": len(cost["trainings_s"]),
-            **{name: cost[name] for name in kept if name in cost},
-        }
-        for stage, cost in costs.items()
-    }
-
-
 def timed_rows(numbers: Row) -> list[dict[str, Any]]:
     """Return the rows of experiment accuracy_and_cost with their run times on this machine, if they were measured."""
     key = itemgetter("study", "method", "setting")

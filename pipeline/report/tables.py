@@ -599,11 +599,9 @@ def claims(numbers: Numbers) -> pd.DataFrame:
 
 
 def stages(numbers: Numbers) -> pd.DataFrame:
-    """Cost of each stage. Computed: all its results from nothing, one training run after another."""
+    """Time and memory of the last run of each stage, which may have reused trainings."""
     return pd.DataFrame(
-        {"stage": stage, "computed, s": f"{cost['computed_s']:.1f}", "last run, s": f"{cost['seconds']:.1f}"}
-        | {"last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else None}
-        | {"training runs": str(cost["trainings_n"]), "reused": str(cost["reused_n"])}
+        {"stage": stage, "time, s": f"{cost['seconds']:.1f}", "CPU time, s": f"{cost['cpu_s']:.1f}"}
         | {"peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}"}
         for stage, cost in numbers["runtime"]["stages"].items()
     )

@@ -16,7 +16,6 @@ from pipeline.provenance import (
     code_version,
     machine,
     read_costs,
-    total_cost_s,
     versions,
 )
 from pipeline.report.experiments import experiment_figures, experiment_numbers
@@ -29,7 +28,6 @@ from pipeline.report.numbers import (
     learning_numbers,
     lost_by_protocol,
     split,
-    stage_costs,
     timed_rows,
 )
 from pipeline.report.page import index_page, run_page, scene_page
@@ -134,7 +132,7 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
 def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.DataFrame) -> dict[str, Any]:
     """Compute the content of numbers.json and provenance.json."""
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
-    runtime: dict[str, Any] = {"stages": stage_costs(costs)}
+    runtime: dict[str, Any] = {"stages": costs}
     seconds = SECONDS / settings.scene / "accuracy_and_cost.json"
     if "accuracy_and_cost" in scene.experiments and seconds.exists():
         runtime["accuracy_and_cost"] = io.read_json(seconds)
@@ -143,7 +141,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
             "trained": ", ".join(sorted({card["git"] for card in inputs.cards})), "versions": versions(),
-            "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
+            "device": f"{machine()}, networks on {trained_on()}",
         },
         "capture": add_up(inputs.ingest_counts) | {"left_out": dict(inputs.dropped)},
         **learning_numbers(table, headline=HEADLINE),

@@ -4,7 +4,6 @@ A training job describes the training of one network. Each model is written with
 describes its training, inputs, outputs and scores.
 """
 
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from jaxtyping import Float32, Int64
 
 from pipeline.catalogue import module_name
 from pipeline.executors import make_executor, prepare_workers
-from pipeline.provenance import COSTS, code_version_of, home, record_trainings
+from pipeline.provenance import code_version_of, home
 from pipeline.settings import Settings, Training
 from pipeline.stage import say
 from reskin import io
@@ -213,9 +212,9 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
     """Run all training jobs whose results are not cached, and return the results of all jobs.
 
-    The costs are recorded, and a warning is printed for training runs that diverged.
+    A warning is printed for training runs that diverged.
     """
-    start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
+    prefix = f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
             jobs,
@@ -224,8 +223,6 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
             cache=home() / CACHE,
             log=lambda line: say(f"{prefix}: {line}"),
         )
-    times = {result.key: (result.seconds, result.reused) for result in results}
-    record_trainings(COSTS / data.scene, stage, times, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
             what = f"training of {job.name} diverged by step {result.stopped_step}"

@@ -43,9 +43,7 @@ def scores(names: tuple[str, ...] = METRICS) -> dict:
 
 
 def cost(seconds: float = 1.0) -> dict:
-    return {
-        "computed_s": 3.0, "seconds": seconds, "trainings_n": 2, "reused_n": 1, "peak_process_memory_MB": 2.0,
-    }  # fmt: skip
+    return {"seconds": seconds, "cpu_s": 3.0, "peak_process_memory_MB": 2.0}
 
 
 NETWORKS = {
@@ -62,7 +60,7 @@ def all_experiments(source: str = "simulated") -> dict:
     counts = {"from_pokes_n": 780, "to_pokes_n": 780}
     return {
         "provenance": {
-            "scene": "x", "source": source, "git": "abc", "seed": 1, "trained": "abc", "device": "z", "seconds": 1.0,
+            "scene": "x", "source": source, "git": "abc", "seed": 1, "trained": "abc", "device": "z",
             "versions": {"numpy": "1", "torch": "2"},
         },
         "capture": {"captures_n": 2, "frames_n": 10, "indentations_n": 5, "left_out": {"low_force_rows_n": 3}},
@@ -112,7 +110,7 @@ def all_experiments(source: str = "simulated") -> dict:
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
         "compare": {"by_board": {}},
         "interference": {"fields_uT": [1.0]},
-        "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
+        "runtime": {"stages": {"report": cost()}},
     }  # fmt: skip
 
 

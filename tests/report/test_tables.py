@@ -97,7 +97,7 @@ COUNTS = [
 
 
 def numbers(cards: list[dict] = CARDS, source: str = "simulated") -> dict:
-    provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
+    provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z"}
     capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
     return {
         "provenance": provenance,

@@ -65,7 +65,7 @@ def numbers(story) -> dict[str, Any]:
 def test_report_contains_provenance_scores_and_byte_counts(story, numbers):
     assert numbers["provenance"]["source"] == "simulated"
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
-    assert {"git", "trained", "device", "versions", "seconds", "runtime"} == set(provenance)
+    assert {"git", "trained", "device", "versions", "runtime"} == set(provenance)
     for row in ("single", "multi", "triplet", "adapted"):
         for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
             assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
