@@ -64,19 +64,6 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
             for name, stat in summary.items()}  # fmt: skip
 
 
-def pace(captures: Sequence[Readings]) -> dict[str, float]:
-    """Return the median time from one indentation to the next, and the duration of the longest capture, in seconds.
-
-    Captures without times are ignored. Returns an empty dict if no other capture has more than one indentation.
-    """
-    timed = [capture for capture in captures if np.isfinite(capture.t_s).all()]
-    steps_s = [np.diff(capture.t_s[first_rows(capture)]) for capture in timed]
-    if not sum(map(len, steps_s)):
-        return {}
-    lasts_s = max(float(capture.t_s[-1] - capture.t_s[0]) for capture in timed)
-    return {"contact_every_s": float(np.median(np.concatenate(steps_s))), "lasts_s": lasts_s}
-
-
 def first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:
     """Return the number of the first reading of each indentation."""
     return np.unique(rank(readings.indentation), return_index=True)[1]

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.description import describe, over_skins, pace
+from pipeline.description import describe, over_skins
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from tests.data.tables import readings
 
 INDENTATIONS_N, READINGS_N = 400, 5
 REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
@@ -93,13 +92,3 @@ def test_largest_force_of_a_skin_is_the_largest_of_all_its_captures():
     summary = over_skins([("s0", {"force_max_N": 2.0}), ("s0", {"force_max_N": 6.0}), ("s1", {"force_max_N": 3.0})])
     assert summary["force_max_N"]["most"] == 6
     assert summary["force_max_N"]["mean"] == 4.5
-
-
-def test_time_per_contact_is_measured_between_indentations():
-    def timed(indentation: list, t_s: list) -> Readings:
-        return readings(f=len(t_s), indentation=np.array(indentation, np.int32), t_s=np.array(t_s, float))
-
-    first = timed([0, 0, 0, 1, 1, 2], [10.0, 10.1, 10.9, 12.0, 12.1, 17.0])
-    assert pace([first]) == pytest.approx({"contact_every_s": 3.5, "lasts_s": 7.0})
-    assert pace([first, timed([0, 1], [0, 1])]) == pytest.approx({"contact_every_s": 2.0, "lasts_s": 7.0})
-    assert pace([timed([0, 1], [np.nan, np.nan])]) == {}

@@ -24,7 +24,7 @@ from pipeline.fitting.presses import RecordedPresses, cosines, explained, growth
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
-from reskin.universal.law import Law, beyond_n, nominal_uT, simulate_uT
+from reskin.universal.law import Law, nominal_uT, simulate_uT
 
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 
@@ -50,8 +50,7 @@ def compare_boards(boards: Mapping[str, RecordedPresses], axes: BoardAxes) -> tu
     laws = {board: fit(presses, axes.setup, TEN) for board, presses in known.items()}
     names, by_board, drawn = list(known), {}, {}
     for board, presses in aligned.items():
-        counts = {"pokes_n": len(boards[board]), "left_out_n": boards[board].excluded_n}
-        by_board[board] = {"frames": check_frames(presses, axes)} | counts
+        by_board[board] = {"frames": check_frames(presses, axes), "pokes_n": len(boards[board])}
         if board in known:
             other = names[(names.index(board) + 1) % len(names)]
             agreements, fitted_uT = _agreements(presses, axes, laws[board], laws[other] if other != board else None)
@@ -74,10 +73,7 @@ def _agreements(
         laws["refitted"] = fit(presses, setup, SEVEN, of_other)
     simulated_uT = {name: simulate_uT(law, setup, place_mm, force_N) for name, law in laws.items()}
     simulated_uT["nominal"] = nominal_uT(setup, place_mm, force_N)
-    agreements = {
-        name: agreement(presses, db_uT) | {"beyond_n": beyond_n(laws.get(name), setup, force_N)}
-        for name, db_uT in simulated_uT.items()
-    }
+    agreements = {name: agreement(presses, db_uT) for name, db_uT in simulated_uT.items()}
     return agreements, simulated_uT["fitted"]
 
 

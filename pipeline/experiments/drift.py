@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Int64
 from pydantic import Field, model_validator
 
 from pipeline import statistics
-from pipeline.description import first_rows, pace, rms
+from pipeline.description import first_rows, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import COLUMNS, show_difference
 from pipeline.plot import COLOURS, drawing, svg
@@ -236,9 +236,7 @@ def measure(
     measured = section.model_dump(
         mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"}, exclude_none=True
     )
-    units_n = [1 + int(unit(capture, section)[-1]) for capture in captures]
     measured |= {"skins_n": len(captures), "seeds_n": section.training.seeds_n}
-    measured |= {"left_out_units_n": sum(max(0, n - section.every_n * len(series[0])) for n in units_n)}
     policy, late_i = late
     ends = [(train, tests[late_i]) for train, *tests in series if train.policy == policy]
     late_numbers: dict[str, Any] = {
@@ -249,7 +247,7 @@ def measure(
     left_pct = float(np.mean([force_left_pct(early.readings, window.readings) for early, window in ends]))
     if not np.isnan(left_pct):
         late_numbers["force_left_pct"] = left_pct
-    return measured | pace(captures) | {"late": late_numbers}
+    return measured | {"late": late_numbers}
 
 
 def force_left_pct(early: Readings, late: Readings) -> float:

@@ -43,8 +43,6 @@ def analyse_levels(
     numbers = {
         "levels_n": len(weight_N),
         "fillings_n": len(db_uT),
-        "held_out_n": len(held_out),
-        "readings_per_stop_n": db_uT.shape[2],
         "step_N": step_N,
         "told_pct": 100 * RESOLVED_SHARE,
         "range_N": float(weight_N[-1]),

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.description import pace, rms
+from pipeline.description import rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
@@ -61,8 +61,7 @@ def variation(settings: Settings, section: Variation, main: Path, indentations: 
         of_skins, skin_lines = over_skins({skin: visits[skin][place_i] for skin in skins})
         places.append({"x_mm": x_mm, "y_mm": y_mm, "time": time, "skins": of_skins})
         plot_data.append({"x_mm": x_mm, "y_mm": y_mm, "time": time_lines, "skins": skin_lines})
-    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn_capture.skin} | pace([worn_capture])
-    numbers |= duration_and_warming(worn_capture, section.contacts_n) | {"places": places}
+    numbers = {"depth_mm": section.depth_mm, "places": places}
     write_results(results, numbers, {"places": plot_data}, read_losses(indentations, {}))
 
 
@@ -150,19 +149,6 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
         spread_uT = rms(np.array([first - second for first, second in combinations(mean_uT.values(), 2)]))
         numbers |= {"spread_uT": spread_uT, "spread_pct": 100 * spread_uT / size_uT}
     return numbers, {skin: np.round(line, DECIMALS).tolist() for skin, line in mean_uT.items()}
-
-
-def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Return the duration of a skin's first `contacts_n` contacts, and the rise of the chips' temperature in that time.
-
-    Values that were not recorded are left out.
-    """
-    early = readings.n_contacts - readings.n_contacts[0] < contacts_n
-    t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
-    order = rank(readings.indentation[early])
-    warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
-    values = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
-    return {name: value for name, value in values.items() if np.isfinite(value)}
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:

@@ -37,8 +37,6 @@ class RecordedPresses:
     group_i : index of the group of each press
     place_mm, force_N : place and force of each press
     db_uT, noload_uT : field change of each press, and the no-load reading before it
-    excluded_n : number of presses that were excluded, because their place is unknown, or because their force is unknown
-        or is not above 0 N
     forces_known : False if no press has a known force. In this case, `force_N` is NaN.
     """
 
@@ -49,7 +47,6 @@ class RecordedPresses:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    excluded_n: int
     forces_known: bool = True
 
     def __len__(self) -> int:
@@ -59,8 +56,8 @@ class RecordedPresses:
 def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPresses:
     """Combine the presses of all captures of one skin on one board, in the order of the captures.
 
-    Presses without a known place and a known force are excluded. If `with_force` is False and no force is known at all,
-    all presses with a known place are kept. Raises SchemaError if no press is left.
+    Presses without a known place and a known force above 0 N are excluded. If `with_force` is False and no force is
+    known at all, all presses with a known place are kept. Raises SchemaError if no press is left.
     """
     parts = [_means(readings) for readings in captures]
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
@@ -79,7 +76,7 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         place_mm=place_mm[known], force_N=force_N[known], db_uT=db_uT[known], noload_uT=noload_uT[known],
-        excluded_n=int((~known).sum()), forces_known=forces_known,
+        forces_known=forces_known,
     )  # fmt: skip
 
 

@@ -35,7 +35,7 @@ def test_simulated_boards_agree_with_fitted_laws_better_than_with_the_nominal_sk
 
 def test_orientation_is_checked_on_every_board(compared):
     numbers, _ = compared
-    assert set(numbers["by_board"]["b3"]) == {"frames", "pokes_n", "left_out_n"}  # its forces are unknown
+    assert set(numbers["by_board"]["b3"]) == {"frames", "pokes_n"}  # its forces are unknown
     for found in numbers["by_board"].values():
         assert found["frames"]["sentence"] == "Labels, chips and skin are oriented as layout reskin states."
 

@@ -102,8 +102,7 @@ def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
         {"x_mm": x_mm, "y_mm": 8.0, "time": time, "skins": {"skins": list(skins), "mean_db_uT": 250.0, **spread}}
         for x_mm in (8.0, 4.0)
     ]
-    when = {"contact_every_s": 0.0575, "lasts_s": 1166.2, "shown_s": 575.0, "warmer_K": 1.85}
-    return {"depth_mm": 1.2, "worn_skin": "s0", "places": places} | when
+    return {"depth_mm": 1.2, "places": places}
 
 
 def test_stage_recovers_the_known_drift_and_gain_of_skins(tmp_path, monkeypatch):
@@ -117,7 +116,6 @@ def test_stage_recovers_the_known_drift_and_gain_of_skins(tmp_path, monkeypatch)
     section = CI.section(Variation, "variation").model_copy(update={"skins_n": 2})
     variation(CI, section, tmp_path / "main", tmp_path / "wear", tmp_path / "results.json")
     results = io.read_json(tmp_path / "results.json")
-    assert results["numbers"]["shown_s"] == pytest.approx(199 * 0.5)  # the visits within the first 200 contacts
     for place in results["numbers"]["places"]:
         assert place["time"]["visits_n"] == 2
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)

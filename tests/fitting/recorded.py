@@ -27,5 +27,5 @@ def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> Reco
     return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), place_mm=AXES.label(place_mm),
         force_N=force_N, db_uT=db_uT + noise_uT * rng.standard_normal(db_uT.shape),
-        noload_uT=np.tile(rest_uT, (50, 1, 1)), excluded_n=0,
+        noload_uT=np.tile(rest_uT, (50, 1, 1)),
     )  # fmt: skip

@@ -29,7 +29,6 @@ def test_presses_are_means_of_the_readings_with_a_force():
     assert pokes.force_N.tolist() == [2.0, 4.0]
     # The first press is the mean of rows 0 to 2, the second one the mean of rows 3 and 4. Row 5 has no force.
     assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]
-    assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
     with pytest.raises(SchemaError, match="experiment compare: board .* has no press with a known place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
