@@ -39,7 +39,7 @@ class Stat:
     - ci95: 95 % interval of the mean over boards, from `BOARDS_MIN` boards on.
     - values: the values of the boards, in their order, if there are fewer boards.
     - sd_seeds: standard deviation over the networks of one unit that differ in their seed, averaged over units.
-    - se, df, p: standard error, degrees of freedom and p-value of a mean difference (null hypothesis: no difference).
+    - df: degrees of freedom of the interval of a mean difference.
     - training_n, boards_n: numbers of training skins and of test boards, if the units are pairs of both.
     """
 
@@ -49,9 +49,7 @@ class Stat:
     ci95: tuple[float, float] | None = None
     values: tuple[float, ...] | None = None
     sd_seeds: float | None = None
-    se: float | None = None
     df: float | None = None
-    p: float | None = None
     training_n: int | None = None
     boards_n: int | None = None
 
@@ -156,29 +154,22 @@ def t_interval(mean: float, se: float, df: float, metric: str = "") -> tuple[flo
     return float(low), float(high)
 
 
-def p_value(mean: float, se: float, df: float) -> float:
-    """Compute the two-sided p-value of a mean difference by Student's t; the null hypothesis is a difference of 0."""
-    from scipy.special import stdtr
-
-    if se == 0:
-        return 1.0 if mean == 0 else 0.0
-    return float(2 * stdtr(df, -abs(mean) / se))
-
-
 def p_value_of(stat: Stat, mean: float, metric: str = "") -> float:
     """Compute the two-sided p-value of the null hypothesis that the mean over boards equals `mean`, by Student's t.
 
     It agrees with the interval of `t_interval`: it is below 0.05 if and only if `mean` is outside `stat.ci95`. If
     `mean` is not a possible value of the metric, it is 0.
     """
-    from scipy.special import stdtrit
+    from scipy.special import stdtr, stdtrit
 
     assert stat.ci95 is not None, "the statistic has an interval over boards"
     df = stat.df or min(filter(None, (stat.training_n, stat.boards_n)), default=stat.n) - 1
     metric = metric if stat.ci95[0] < stat.ci95[1] else ""
     low, high, ours, null = _transform(np.array([*stat.ci95, stat.mean, mean]), metric)
+    if not np.isfinite(null):
+        return 0.0
     se = (high - low) / 2 / stdtrit(df, (1 + CONFIDENCE) / 2)
-    return p_value(ours - null, se, df) if np.isfinite(null) else 0.0
+    return float(2 * stdtr(df, -abs(ours - null) / se)) if se else float(ours == null)
 
 
 def _transform(values: Float[np.ndarray, " n"], metric: str) -> Float[np.ndarray, " n"]:
@@ -349,15 +340,13 @@ def differences(method: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
 def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     """Summarise differences over boards.
 
-    Key `by_board` of the result contains the differences of each board. If there are `BOARDS_MIN` boards or more, the
-    summary of each metric has the standard error `se`, the degrees of freedom `df`, and the p-value `p` that follows
-    from them under the null hypothesis of no difference.
+    Key `by_board` of the result contains the differences of each board.
     """
     summary = summarise(by_board, boards=True, differences=True)
     stats = {name: replace(stat, mean=round(stat.mean, DECIMALS)) for name, stat in summary.items()}
     for name, stat in stats.items():
         if stat.ci95 is not None and stat.sd is not None:
-            stats[name] = _t_test(stat, stat.sd / stat.n**0.5, stat.n - 1)
+            stats[name] = _with_interval(stat, stat.sd / stat.n**0.5, stat.n - 1)
     return {**stats, "by_board": records(by_board)}
 
 
@@ -365,8 +354,8 @@ def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, 
     """Summarise the differences between `method` and `single`, each of whose networks is trained on only one skin.
 
     The differences are computed on the skins on which `single` was tested. The result has the same form as the result
-    of `paired`. Its interval and p-value are computed with `two_way_error`, because both the test boards and the
-    training skins of `single` are samples.
+    of `paired`. Its interval is computed with `two_way_error`, because both the test boards and the training skins of
+    `single` are samples.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
@@ -376,14 +365,14 @@ def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, 
     summary = summarise_differences(by_pair.groupby("board").mean())
     for name in by_pair:
         if name in summary:
-            stat = replace(summary[name], ci95=None, se=None, df=None, p=None)
+            stat = replace(summary[name], ci95=None, df=None)
             error = two_way_error(by_pair[name].dropna().unstack())
-            summary[name] = stat if error is None else _t_test(stat, *error)
+            summary[name] = stat if error is None else _with_interval(stat, *error)
     return summary
 
 
-def _t_test(stat: Stat, se: float, df: float) -> Stat:
-    return replace(stat, ci95=t_interval(stat.mean, se, df), se=se, df=df, p=p_value(stat.mean, se, df))
+def _with_interval(stat: Stat, se: float, df: float) -> Stat:
+    return replace(stat, ci95=t_interval(stat.mean, se, df), df=df)
 
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:

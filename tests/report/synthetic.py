@@ -28,8 +28,13 @@ def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
     """Return a summary of scores over boards, whose 95 % confidence interval is (low, high)."""
     reach, middle = (high - low) / 2, (low + high) / 2
     se = reach / t.ppf(0.975, n - 1)
-    stat = {"mean": middle, "sd": se * n**0.5, "n": n, "ci95": [low, high]}
-    return stat | {"se": se, "df": n - 1, "p": 2 * t.sf(abs(middle) / se, n - 1) if se else 0.0}
+    return {"mean": middle, "sd": se * n**0.5, "n": n, "ci95": [low, high], "df": n - 1}
+
+
+def p_value(low: float, high: float, n: int = 6) -> float:
+    """Return the p-value of the null hypothesis that the mean of `over_boards(low, high, n)` is 0."""
+    se = (high - low) / 2 / t.ppf(0.975, n - 1)
+    return 2 * t.sf(abs(low + high) / 2 / se, n - 1)
 
 
 def difference(low: float = 0.5, high: float = 1.5) -> dict:

@@ -25,7 +25,7 @@ from pipeline.report.claims import (
 )
 from pipeline.statistics import p_value_of, statistic
 from reskin.errors import ParamsError, SchemaError
-from tests.report.synthetic import over_boards
+from tests.report.synthetic import over_boards, p_value
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"
 CLAIMS = read_claims()
@@ -98,7 +98,7 @@ def test_p_values_are_adjusted_within_a_family():
     ends = [(0.5, 5.0), (0.2, 5.0), (0.05, 5.0), (0.05, 5.0)]
     claims = [claim(id=f"c{i}", ours=f"x{i}.accuracy_pct", family="g" if i == 3 else "f") for i in range(4)]
     table = evaluate({f"x{i}": {"accuracy_pct": over_boards(*low_high)} for i, low_high in enumerate(ends)}, claims)
-    p = [over_boards(*low_high)["p"] for low_high in ends]
+    p = [p_value(*low_high) for low_high in ends]
     assert table["p_adjusted"].tolist() == pytest.approx(
         [3 * p[0], max(3 * p[0], 2 * p[1]), max(2 * p[1], p[2]), p[3]], rel=0.005
     )
@@ -108,11 +108,11 @@ def test_p_values_are_adjusted_within_a_family():
 def test_claim_about_a_list_holds_only_if_it_holds_for_each_row():
     sweep = [{"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (2, 3)))]
     each = claim(ours="x.*.accuracy_pct")
-    assert judge({"x": sweep}, each) == (SUPPORTED, pytest.approx(over_boards(1, 2)["p"]))
+    assert judge({"x": sweep}, each) == (SUPPORTED, pytest.approx(p_value(1, 2)))
     sweep.append({"skins_n": 9, "accuracy_pct": over_boards(-1, 2)})
     assert judge({"x": sweep}, each)[0] == INCONCLUSIVE
     sweep.append({"skins_n": 15, "accuracy_pct": over_boards(-2, -1)})
-    assert judge({"x": sweep}, each) == (CONTRADICTED, pytest.approx(4 * over_boards(-2, -1)["p"]))
+    assert judge({"x": sweep}, each) == (CONTRADICTED, pytest.approx(4 * p_value(-2, -1)))
     assert judge({"x": sweep}, claim(ours="x.skins_n=6.accuracy_pct"))[0] == SUPPORTED
 
 
