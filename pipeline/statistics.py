@@ -4,7 +4,7 @@ In statistical tests, one board counts as one observation. The skins of a board 
 because they share the board and are tested with the same networks, which were trained without this board.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -29,6 +29,7 @@ DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, 
 BOARDS_MIN = 4  # with fewer boards, no interval is computed; the value of each board is given instead
 
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
+Transformation = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -111,47 +112,42 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 # --- Intervals and p-values ---
 
 
-def interval(values: Values, metric: str = "") -> tuple[float, float] | None:
-    """Compute the two-sided 95 % interval of a mean by Student's t (see `t_interval`).
-
-    Returns None if there are fewer than two values.
-
-    >>> interval([1.0]) is None
-    True
-    >>> [round(float(end), 2) for end in interval([1.0, 3.0])]  # t is 12.71 with one degree of freedom
-    [-10.71, 14.71]
-    >>> [round(float(end), 1) for end in interval([60.0, 90.0, 99.0, 95.0], "accuracy_pct")]
-    [37.1, 98.5]
-    """
-    n = len(values)
-    if n < 2:
-        return None
-    return t_interval(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
-
-
 def t_interval(mean: float, se: float, df: float, metric: str = "") -> tuple[float, float]:
     """Compute the 95 % interval of a mean from its standard error by Student's t, within the metric's possible range.
 
-    The delta method gives the interval g(mean) +- t g'(mean) se, which is transformed back by the inverse of g. The
-    transformation g(x) is the logit for percentages, the logarithm for squared errors, -log(1 - x) for metrics that are
-    at most 1, and x for all other metrics.
+    The delta method gives the interval g(mean) +- t g'(mean) se, which is transformed back by the inverse of g (see
+    `_transformation`).
+
+    >>> [round(float(end), 2) for end in t_interval(2.0, 1.0, 1)]  # t is 12.71 with one degree of freedom
+    [-10.71, 14.71]
+    >>> [round(float(end), 1) for end in t_interval(86.0, 8.86, 3, "accuracy_pct")]
+    [37.1, 98.5]
     """
-    from scipy.special import expit, logit, stdtrit  # imported late, because SciPy is only needed for intervals
+    from scipy.special import stdtrit  # imported late, because SciPy is only needed for intervals
 
     half_width = float(stdtrit(df, (1 + CONFIDENCE) / 2)) * se
     if half_width == 0:
         return mean, mean
-    ends = np.array([-half_width, half_width])
-    if metric in PERCENTAGES:
-        fraction = mean / 100
-        low, high = 100 * expit(logit(fraction) + ends / (100 * fraction * (1 - fraction)))
-    elif metric.startswith("mse_"):
-        low, high = mean * np.exp(ends / mean)
-    elif metric in AT_MOST_1:
-        low, high = 1 - (1 - mean) * np.exp(-ends / (1 - mean))
-    else:
-        low, high = mean + ends
+    g, slope, inverse = _transformation(metric)
+    low, high = inverse(g(mean) + slope(mean) * np.array([-half_width, half_width]))
     return float(low), float(high)
+
+
+def _transformation(metric: str) -> tuple[Transformation, Transformation, Transformation]:
+    """Return the transformation g of a metric whose range is limited, its derivative, and its inverse.
+
+    g(x) is the logit for percentages, the logarithm for squared errors, -log(1 - x) for metrics that are at most 1, and
+    x for all other metrics.
+    """
+    from scipy.special import expit, logit
+
+    if metric in PERCENTAGES:
+        return lambda x: logit(x / 100), lambda x: 100 / (x * (100 - x)), lambda y: 100 * expit(y)
+    if metric.startswith("mse_"):
+        return np.log, lambda x: 1 / x, np.exp
+    if metric in AT_MOST_1:
+        return lambda x: -np.log(1 - x), lambda x: 1 / (1 - x), lambda y: 1 - np.exp(-y)
+    return lambda x: x, lambda x: 1.0, lambda y: y
 
 
 def p_value_of(stat: Stat, mean: float, metric: str = "") -> float:
@@ -165,23 +161,12 @@ def p_value_of(stat: Stat, mean: float, metric: str = "") -> float:
     assert stat.ci95 is not None, "the statistic has an interval over boards"
     df = stat.df or min(filter(None, (stat.training_n, stat.boards_n)), default=stat.n) - 1
     metric = metric if stat.ci95[0] < stat.ci95[1] else ""
-    low, high, ours, null = _transform(np.array([*stat.ci95, stat.mean, mean]), metric)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high, ours, null = _transformation(metric)[0](np.array([*stat.ci95, stat.mean, mean]))
     if not np.isfinite(null):
         return 0.0
     se = (high - low) / 2 / stdtrit(df, (1 + CONFIDENCE) / 2)
     return float(2 * stdtr(df, -abs(ours - null) / se)) if se else float(ours == null)
-
-
-def _transform(values: Float[np.ndarray, " n"], metric: str) -> Float[np.ndarray, " n"]:
-    """Apply the transformation g of `t_interval`."""
-    from scipy.special import logit
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if metric in PERCENTAGES:
-            return np.asarray(logit(values / 100))
-        if metric.startswith("mse_"):
-            return np.log(values)
-        return -np.log(1 - values) if metric in AT_MOST_1 else values
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
@@ -209,12 +194,13 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> Stat
     stat = Stat(float(np.mean(values)), len(values))
     if len(values) < 2:
         return stat
-    stat = replace(stat, sd=float(np.std(values, ddof=1)))
+    sd = float(np.std(values, ddof=1))
+    stat = replace(stat, sd=sd)
     if not boards:
         return stat
     if len(values) < BOARDS_MIN:
         return replace(stat, values=tuple(float(value) for value in values))
-    return replace(stat, ci95=interval(values, metric))
+    return replace(stat, ci95=t_interval(stat.mean, sd / stat.n**0.5, stat.n - 1, metric))
 
 
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> Summary:

@@ -23,12 +23,12 @@ from pipeline.scores import (
 )  # fmt: skip
 from pipeline.statistics import (
     holm,
-    interval,
     over_boards,
     over_folds,
     p_value_of,
     paired,
     paired_with_single,
+    statistic,
     two_way_error,
 )
 from reskin.data.splits import Split, draw_folds
@@ -132,7 +132,7 @@ def test_table_is_equal_after_it_was_written_and_read(tmp_path):
 @given(VALUES)
 def test_interval_equals_students_interval_of_scipy(values):
     low, high = t.interval(0.95, len(values) - 1, np.mean(values), np.std(values, ddof=1) / np.sqrt(len(values)))
-    assert interval(values) == pytest.approx([low, high], abs=DOUBLE)
+    assert statistic(values, boards=True).ci95 == pytest.approx([low, high], abs=DOUBLE)
 
 
 @FEW
@@ -239,10 +239,11 @@ def test_variance_over_training_skins_and_boards_is_the_sum_of_both_variances(ro
 def test_intervals_stay_in_the_range_of_the_metric(values):
     mean = float(np.mean(values))
     for metric, low, high in (("accuracy_pct", 0, 100), ("mse_xy_mm2", 0, np.inf)):
-        ends = interval(values, metric)
+        ends = statistic(values, boards=True, metric=metric).ci95
         assert low <= ends[0] <= mean * (1 + 1e-12)
         assert mean * (1 - 1e-12) <= ends[1] <= high
-    ends = interval([1 - value for value in values], "r2_f")  # These values are far below the upper limit of 1.
+    # These values are far below the upper limit of 1.
+    ends = statistic([1 - value for value in values], boards=True, metric="r2_f").ci95
     assert ends[0] <= 1 - mean + 1e-9
     assert 1 - mean - 1e-9 <= ends[1] <= 1
 
