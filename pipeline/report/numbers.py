@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.catalogue import EXPERIMENTS
+from pipeline.catalogue import EXPERIMENTS, module_of
 from pipeline.paper import PLATEAU_POKES_N
 from pipeline.scenes import TABLE_2
 from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
@@ -224,6 +224,19 @@ def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
         total.update({"captures_n": 1} | {name: count for name, count in counts.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
+
+
+def experiment_numbers(results: Mapping[str, Any], table: pd.DataFrame) -> dict[str, Any]:
+    """Return the numbers of experiments: those that they measured, and summaries of their rows of the table of scores.
+
+    results: content of the files that the experiments wrote, by experiment.
+    """
+    numbers = {}
+    for name, result in results.items():
+        measured = result["numbers"]
+        scores = select(table, experiment=name)
+        numbers[name] = module_of(name).summarise(scores, measured) if EXPERIMENTS[name].scores else measured
+    return numbers
 
 
 def before_touch_numbers(table: pd.DataFrame) -> dict[str, Any]:

@@ -4,8 +4,8 @@ The digests of a stage are written to the file data/code/<stage>, on which the s
 edited, the files of the stages that import this module change, and DVC runs these stages again. Comments and docstrings
 are not part of a digest, so edits of them cause no runs.
 
-The modules in `SHOWING` affect only how results are shown. Therefore, they are included only in the files of stages
-that show results.
+The modules in `SHOWING` affect only how results are shown. Therefore, they are included only in the file of stage
+report.
 """
 
 import gc
@@ -17,9 +17,6 @@ from reskin.code import digest, imported
 
 # Packages and modules that only show results, and the catalogue, whose effects on other stages are in the plan.
 SHOWING = ("pipeline.catalogue", "pipeline.report", "pipeline.plot", "pipeline.formatting", "pipeline.paper")
-# A stage that imports this module shows results. The module imports the modules of experiments by their names, so these
-# imports cannot be found in its code.
-PRESENTATION = "pipeline.report.experiments"
 
 
 def all_stages() -> list[str]:
@@ -29,10 +26,9 @@ def all_stages() -> list[str]:
 
 def digests_of(stage: str) -> dict[str, str]:
     """Return the digests of all modules that affect the outputs of a stage, by the name of the module."""
-    names = imported(module_name(stage))
-    if PRESENTATION in names:
+    if stage == "report":  # it shows results, and imports the modules of experiments by their names
         return {name: digest(name) for name in imported(module_name(stage), *map(module_name, ANALYSES))}
-    return {name: digest(name) for name in names if not name.startswith(SHOWING)}
+    return {name: digest(name) for name in imported(module_name(stage)) if not name.startswith(SHOWING)}
 
 
 def write_digests(digests: Path) -> None:

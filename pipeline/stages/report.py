@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import PLAN
+from pipeline.catalogue import ANALYSES, module_of
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded
 from pipeline.provenance import (
@@ -18,12 +19,12 @@ from pipeline.provenance import (
     read_costs,
     versions,
 )
-from pipeline.report.experiments import experiment_figures, experiment_numbers
 from pipeline.report.figures import Outline, error_grids, score_figures
 from pipeline.report.numbers import (
     add_up,
     before_touch_numbers,
     count_trainings,
+    experiment_numbers,
     headline_scores,
     learning_numbers,
     lost_by_protocol,
@@ -91,7 +92,12 @@ def draw(numbers: dict[str, Any], plot_data: dict[str, Any], predictions: list[A
     of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
     outline = None if of_layout is None else Outline(**of_layout)
     figures = dict(error_grids(predictions, HEADLINE, source, outline))
-    return figures | score_figures(numbers, source) | experiment_figures(numbers, plot_data, source)
+    figures |= score_figures(numbers, source)
+    for name in [name for name in ANALYSES if name in numbers]:
+        module = module_of(name)
+        if hasattr(module, "figures"):
+            figures |= module.figures(numbers[name], plot_data[name], source)
+    return figures
 
 
 @dataclass(frozen=True)
