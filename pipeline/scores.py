@@ -69,7 +69,7 @@ def join(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 
 def rows_of_cards(cards: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Tabulate the scores of trained networks from their model cards (see `pipeline.training.jobs.ModelCard`)."""
+    """Tabulate the scores of trained networks from their model cards (see `pipeline.training.jobs.model_card`)."""
     return rows_of_networks((_keys_of_card(card), card["scores"]) for card in cards)
 
 

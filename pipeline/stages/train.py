@@ -3,8 +3,9 @@
 They train networks on one skin or on many skins, and adapt networks to new skins.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,6 @@ from pipeline.settings import Adaptations, Settings, Training
 from pipeline.training.before_contact import BY_TIME, score_before_contact
 from pipeline.training.final import train_final
 from pipeline.training.jobs import (
-    ModelCard,
     adaptation_jobs,
     code_of,
     make_jobs,
@@ -114,7 +114,7 @@ def adapt(
     write_scores(scores, rows_of_cards(cards))
 
 
-def write_plots(plots: Path, models: Path, cards: Sequence[ModelCard]) -> None:
+def write_plots(plots: Path, models: Path, cards: Sequence[Mapping[str, Any]]) -> None:
     """Write the data of the plots that `dvc plots` shows: loss curves, and predictions against true values.
 
     They are those of the section's own recipe: the mean loss over its networks at each step, and predictions of test

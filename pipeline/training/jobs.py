@@ -7,7 +7,7 @@ describes its training, inputs, outputs and scores.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -67,38 +67,6 @@ class AdaptationPokes:
     seed_i: int
     what: str
     lines: Lines
-
-
-class ModelCard(TypedDict):
-    """The JSON card of a model, which describes training, inputs, outputs and scores."""
-
-    format: str
-    scene: str
-    question: str  # the experiment
-    recipe_name: str
-    recipe: dict[str, Any]
-    fold: str
-    seed: int
-    seed_i: int
-    key: str
-    architecture: dict[str, list[int]]
-    input: dict[str, Any]
-    output: dict[str, str]
-    scaler: dict[str, list[float]]
-    stopped_step: int | None
-    explained_min: float | None
-    collapsed: bool
-    collapsed_before_n: int
-    train_boards: list[str]
-    train_skins: list[str]
-    train_rows_n: int
-    test_boards: list[str]
-    test_skins: list[str]
-    curve: list[float]
-    curve_steps: list[int]
-    tuning: NotRequired[dict[str, Any]]
-    scores: NotRequired[dict[str, Any]]
-    git: NotRequired[str]
 
 
 def preload_training() -> None:
@@ -235,7 +203,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
-) -> list[ModelCard]:
+) -> list[dict[str, Any]]:
     """Write models, cards and predictions to folder `models`; return the cards."""
     code = code_of(stage)
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
@@ -253,39 +221,39 @@ def code_of(stage: str) -> str:
     return code_version_of(imported(module_name(stage)))
 
 
-def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> ModelCard:
+def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> dict[str, Any]:
     """Describe a trained network, without its scores."""
-    card = ModelCard(
-        format=FORMAT,
-        scene=scene,
-        question=job.experiment,
-        recipe_name=job.recipe_name,
-        recipe=job.recipe.model_dump(mode="json"),
-        fold=job.fold,
-        seed=job.seed,
-        seed_i=job.seed_i,
-        key=result.key,
-        architecture={name: list(value.shape) for name, value in result.weights.items()},
-        input={
+    card: dict[str, Any] = {
+        "format": FORMAT,
+        "scene": scene,
+        "question": job.experiment,
+        "recipe_name": job.recipe_name,
+        "recipe": job.recipe.model_dump(mode="json"),
+        "fold": job.fold,
+        "seed": job.seed,
+        "seed_i": job.seed_i,
+        "key": result.key,
+        "architecture": {name: list(value.shape) for name, value in result.weights.items()},
+        "input": {
             "quantity": "change of field",
             "unit": "uT",
             "channels_n": rows.db_uT.shape[1],
             "view": job.recipe.inputs,
         },
-        output={name: name.rsplit("_", 1)[1] for name in TARGETS},
-        scaler={name: value.tolist() for name, value in result.scaler.arrays().items()},
-        stopped_step=result.stopped_step,
-        explained_min=None if result.explained_min is None else round(result.explained_min, 6),
-        collapsed=result.collapsed,
-        collapsed_before_n=result.collapsed_before_n,
-        train_boards=np.unique(rows.board[job.train]).tolist(),
-        train_skins=np.unique(rows.skin[job.train]).tolist(),
-        train_rows_n=len(job.train),
-        test_boards=np.unique(rows.board[job.test]).tolist(),
-        test_skins=np.unique(rows.skin[job.test]).tolist(),
-        curve=[round(value, 9) for value in result.curve],
-        curve_steps=curve_steps(job.schedule.steps_n)[: len(result.curve)],
-    )
+        "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
+        "scaler": {name: value.tolist() for name, value in result.scaler.arrays().items()},
+        "stopped_step": result.stopped_step,
+        "explained_min": None if result.explained_min is None else round(result.explained_min, 6),
+        "collapsed": result.collapsed,
+        "collapsed_before_n": result.collapsed_before_n,
+        "train_boards": np.unique(rows.board[job.train]).tolist(),
+        "train_skins": np.unique(rows.skin[job.train]).tolist(),
+        "train_rows_n": len(job.train),
+        "test_boards": np.unique(rows.board[job.test]).tolist(),
+        "test_skins": np.unique(rows.skin[job.test]).tolist(),
+        "curve": [round(value, 9) for value in result.curve],
+        "curve_steps": curve_steps(job.schedule.steps_n)[: len(result.curve)],
+    }
     if job.tuning is not None:
         card["tuning"] = _tuning_record(job.tuning, rows)
     return card
@@ -304,7 +272,7 @@ def _tuning_record(tuning: Adaptation | FineTuning, rows: Rows) -> dict[str, Any
     }
 
 
-def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> ModelCard:
+def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> dict[str, Any]:
     """Describe a trained network with its scores on the test rows."""
     card = model_card(job, result, data.rows, data.scene)
     card["scores"] = score_test(data, job.test, result.predicted)
