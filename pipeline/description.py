@@ -74,6 +74,11 @@ def rms(values: Float[np.ndarray, "..."]) -> float:
     return float(np.sqrt(np.mean(values.astype(float) ** 2)))
 
 
+def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
+    """Return rms error / rms true value."""
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
 def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
     b_uT = np.abs(np.median(noload_uT.astype(np.float64), axis=0)).reshape(-1, AXES_PER_CHIP_N)
     return {

@@ -28,6 +28,7 @@ from pydantic import Field
 from scipy.constants import micro, milli, mu_0
 from scipy.integrate import solve_ivp
 
+from pipeline.description import norm_error
 from pipeline.experiments.results import write_results
 from pipeline.plot import drawing, svg
 from pipeline.provenance import SECONDS
@@ -139,11 +140,6 @@ def median_s(call: Callable[[], object], repeats_n: int) -> float:
         call()
         times_s.append(perf_counter() - start_s)
     return float(np.median(times_s))
-
-
-def norm_error(found: Float[np.ndarray, "..."], truth: Float[np.ndarray, "..."]) -> float:
-    """Return rms error / rms true value."""
-    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
 # Quadrature of the field ------------------------------------------------------------------------------------------

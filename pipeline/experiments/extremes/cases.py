@@ -114,8 +114,3 @@ def relative_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*
 def scaled_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
     """Return largest absolute error / largest absolute true value."""
     return float(np.abs(found - truth).max() / np.abs(truth).max())
-
-
-def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return Euclidean norm of the errors / Euclidean norm of the true values."""
-    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))

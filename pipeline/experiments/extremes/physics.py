@@ -17,12 +17,12 @@ from jaxtyping import Float
 from scipy.constants import micro, milli
 from scipy.special import j0, j1
 
+from pipeline.description import norm_error
 from pipeline.experiments.extremes.cases import (
     Case,
     World,
     largest,
     max_error,
-    norm_error,
     relative_error,
     scaled_error,
 )
