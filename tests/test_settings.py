@@ -143,13 +143,12 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible", "new_board", "accuracy_and_cost"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "drift", "shear", "sleeve"}
-FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.triplet.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", ADAPTING),
-    (SKIN, "skin.modulus_kPa=300.0", {"physics", *FINGERPRINTED, "interference"}),
-    (SKIN, "chip.gain_sel=4", {"physics", *FINGERPRINTED, "interference"}),
+    (SKIN, "skin.modulus_kPa=300.0", {"physics", "interference"}),
+    (SKIN, "chip.gain_sel=4", {"physics", "interference"}),
     (SKIN, "terms.ageing.settling=0.2", {"physics"}),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
     (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag"}),

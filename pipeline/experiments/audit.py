@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int
 from pipeline.experiments.results import write_results
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.training.choice import fingerprint, settings_of, without_budget
+from pipeline.training.choice import settings_of, without_budget
 from pipeline.training.jobs import SceneData, read_data
 from reskin import io
 from reskin.config import Strict, parse
@@ -44,7 +44,6 @@ RULES = {
     "pokes": "all indentations for adaptation are in the pool of the fold, and none of them is tested",
     "settings: boards": "no tested board was used to choose the settings",
     "settings: skins": "no tested skin was used to choose the settings",
-    "settings: physics": "the simulated skin is that of the choice; a difference is only listed",
     "settings: recipe": "the recipe is the chosen one; differences are only listed",
 }
 
@@ -321,7 +320,6 @@ class Choice(Strict, extra="allow"):
     seed: int
     boards: tuple[str, ...]
     skins: tuple[str, ...]
-    physics: str = "not recorded"
     chosen: dict[str, dict[str, Any]]
 
 
@@ -341,9 +339,6 @@ def check_settings(data: SceneData, choice: Path, models: Path) -> Iterator[Chec
         shared = np.intersect1d(tested, studied) if same_draw else tested[:0]
         found = f"{len(shared)} of {len(tested)} tested {what} are {what} of scene {record.scene}{names(shared)}"
         yield Check(f"settings: {what}", "all folds", found, not len(shared), remedy=remedy)
-    physics = fingerprint(data.settings.shared)
-    found = "equal" if physics == record.physics else f"{NOT_CHOSEN}: fingerprint {record.physics}, now {physics}"
-    yield Check("settings: physics", "all stages", found, holds=True)
     for stage in data.settings.models:
         cards = (io.read_json(file) for file in sorted((models / stage).glob("*.json")))
         used = without_budget(settings_of(next(card for card in cards if card["recipe_name"] == HEADLINE)))

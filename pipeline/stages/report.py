@@ -37,7 +37,7 @@ from pipeline.scenes import Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.training.choice import choose, fingerprint, to_record
+from pipeline.training.choice import choose, to_record
 from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
@@ -56,8 +56,7 @@ def report(
     table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
     numbers = rounded(compute_numbers(settings, scene, inputs, table))
     if "choice" in scene.experiments:
-        physics = fingerprint(settings.shared)
-        record = to_record(numbers["chosen"], inputs.cards, source=scene.source, seed=settings.seed, physics=physics)
+        record = to_record(numbers["chosen"], inputs.cards, source=scene.source, seed=settings.seed)
         io.write_json(reports / "choice.json", record)
     shared, of_this_run = split(numbers)
     io.write_json(reports / "numbers.json", shared)

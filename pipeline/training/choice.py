@@ -7,27 +7,16 @@ with a collapsed training run (a network whose predictions are nearly constant) 
 
 Unless a network is adapted later, the triplet term of the loss only increases its error. The weight of the triplet term
 is therefore chosen together with the settings of the adaptation.
-
-The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
-fingerprint that the current code computes.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.constants import micro, milli
 
 from pipeline.scores import rows_of_cards
 from pipeline.statistics import over_folds
-from reskin.config import parse
 from reskin.errors import ParamsError
-from reskin.layouts import PAPER, geometry
-from reskin.physics.board import BoardDesign, Spreads, draw_board
-from reskin.physics.magnet import Quadrature
-from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
@@ -70,15 +59,10 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     return {"train_multi": chosen_multi, "adapt": chosen_adapt, "train_triplet": chosen_triplet}
 
 
-def to_record(
-    chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
-) -> dict[str, Any]:
-    """Record the choice with its boards and skins, for the audit of the scenes that use the chosen settings.
-
-    `physics` is the fingerprint of the simulated skin's settings.
-    """
+def to_record(chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int) -> dict[str, Any]:
+    """Record the choice with its boards and skins, for the audit of the scenes that use the chosen settings."""
     return {
-        "scene": cards[0]["scene"], "source": source, "seed": seed, "physics": physics,
+        "scene": cards[0]["scene"], "source": source, "seed": seed,
         "boards": sorted({board for card in cards for board in card["test_boards"]}),
         "skins": sorted({skin for card in cards for skin in card["test_skins"]}),
         "chosen": {stage: choice["settings"] for stage, choice in chosen.items()},
@@ -164,31 +148,3 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
         }
         for name, rows in rows_of_cards(cards).groupby("recipe", sort=False)
     ]
-
-
-# --- Fingerprint of the simulation: it changes only if the simulated fields or forces of given indentations change ---
-
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # scene quick uses the same rule
-BOARD = parse(BoardDesign, geometry(PAPER)["design"], "reskin/layouts")
-PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
-DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # number of significant digits; a change of the physics changes these digits, but rounding errors do not
-
-
-def fingerprint(sections: Mapping[str, Any]) -> str:
-    """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
-
-    A refactoring does not change the digest; a change of the physics or of a setting does.
-    """
-    design = parse(SkinDesign, sections["skin"], "skin")
-    spreads = parse(Spreads, sections["spreads"], "spreads")
-    indentations_m = milli * np.array([(*place, depth) for place in PLACES_MM for depth in DEPTHS_MM])
-    simulated = []
-    for name in ("b0", "b1"):
-        board = draw_board(BOARD, spreads, seed=0, name=name)
-        skin = draw_skin(design, spreads, seed=0, name=f"{name}_s0", rule=RULE)
-        rest_T, change_T = changes_of_field(board, skin, indentations_m)
-        simulated += [rest_T.ravel() / micro, change_T.ravel() / micro, forces(skin, indentations_m[:, 2])]
-    rounded = [f"{value:.{DIGITS - 1}e}" for value in np.concatenate(simulated)]
-    content = json.dumps([rounded, sections["rig"], sections["chip"]], sort_keys=True, default=str)
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
