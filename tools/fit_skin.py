@@ -28,12 +28,13 @@ import pandas as pd
 
 from pipeline.experiments.compare import agreement
 from pipeline.experiments.results import read_captures
+from pipeline.fitting.axes import BoardAxes
 from pipeline.fitting.law_fit import AlignedPresses, fit
 from pipeline.fitting.presses import pool_skins
 from pipeline.settings import read_settings
 from pipeline.training.recorded import Compare
 from reskin.seeds import rng_for
-from reskin.universal.law import Setup, beyond_n, simulate_uT
+from reskin.universal.law import beyond_n, simulate_uT
 
 FORCE_MAX_N = 4.5
 DRAWS_N = 10
@@ -80,13 +81,14 @@ def resamples(presses: AlignedPresses, draws_n: int, seed: int) -> Iterator[Alig
         yield select(presses, np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))]))
 
 
-def fit_board(presses: AlignedPresses, setup: Setup, draws_n: int) -> Iterator[dict[str, object]]:
+def fit_board(presses: AlignedPresses, axes: BoardAxes, draws_n: int) -> Iterator[dict[str, object]]:
     """Yield one row per fit of `FITS`: fitted values, their uncertainties (`sd_...`), agreement with the board."""
+    setup = axes.setup
     for name, (names, force_max_N) in FITS.items():
         chosen = select(presses, presses.recorded.force_N <= force_max_N)
-        started = replace(setup, start_law=replace(setup.start, **STARTS[name]))
-        law = fit(chosen, started, names)
-        drawn = pd.DataFrame([asdict(fit(each, started, names, law)) for each in resamples(chosen, draws_n, 0)])
+        mean = replace(axes.start, **STARTS[name])
+        law = fit(chosen, setup, names, mean)
+        drawn = pd.DataFrame([asdict(fit(each, setup, names, mean, law)) for each in resamples(chosen, draws_n, 0)])
         found = agreement(chosen, simulate_uT(law, setup, chosen.place_mm, chosen.recorded.force_N))
         growth = found.get("growth", {"recorded": np.nan, "simulated": np.nan})
         yield {
@@ -129,7 +131,7 @@ def main() -> None:
     known = {board: presses for board, presses in boards.items() if presses.forces_known}
     if len(known) < 2:
         sys.exit(f"scene {arguments.scene} has {len(known)} boards with known forces; a spread needs at least two")
-    rows = [row for presses in known.values() for row in fit_board(axes.align(presses), axes.setup, arguments.draws_n)]
+    rows = [row for presses in known.values() for row in fit_board(axes.align(presses), axes, arguments.draws_n)]
     fits = pd.DataFrame(rows)
     print(f"Fits to the recorded boards of scene {arguments.scene} (`python -m tools.fit_skin {arguments.scene}`)\n")
     print(ABOUT)

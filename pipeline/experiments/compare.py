@@ -24,7 +24,7 @@ from pipeline.fitting.presses import RecordedPresses, cosines, explained, growth
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from pipeline.training.recorded import Compare
-from reskin.universal.law import Law, nominal_uT, simulate_uT
+from reskin.universal.law import Law, simulate_uT
 
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 
@@ -47,7 +47,7 @@ def compare_boards(boards: Mapping[str, RecordedPresses], axes: BoardAxes) -> tu
     """
     aligned = {board: axes.align(thin(presses, FITTED_MAX_N)) for board, presses in boards.items()}
     known = {board: presses for board, presses in aligned.items() if presses.recorded.forces_known}
-    laws = {board: fit(presses, axes.setup, TEN) for board, presses in known.items()}
+    laws = {board: fit(presses, axes.setup, TEN, axes.start) for board, presses in known.items()}
     names, by_board, drawn = list(known), {}, {}
     for board, presses in aligned.items():
         by_board[board] = {"frames": check_frames(presses, axes), "pokes_n": len(boards[board])}
@@ -70,9 +70,9 @@ def _agreements(
     place_mm, force_N, setup = presses.place_mm, presses.recorded.force_N, axes.setup
     laws = {"fitted": fitted}
     if of_other is not None:
-        laws["refitted"] = fit(presses, setup, SEVEN, of_other)
+        laws["refitted"] = fit(presses, setup, SEVEN, axes.start, of_other)
+    laws["nominal"] = axes.nominal
     simulated_uT = {name: simulate_uT(law, setup, place_mm, force_N) for name, law in laws.items()}
-    simulated_uT["nominal"] = nominal_uT(setup, place_mm, force_N)
     agreements = {name: agreement(presses, db_uT) for name, db_uT in simulated_uT.items()}
     return agreements, simulated_uT["fitted"]
 

@@ -4,18 +4,19 @@ Places of recorded presses are in the coordinates of the labels, and fields are 
 universal model and simulations use the board's axes, with the origin at the board's middle.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import kilo, mega
 from scipy.spatial.transform import Rotation
 
 from pipeline.fitting.law_fit import AlignedPresses
 from pipeline.fitting.presses import RecordedPresses
 from reskin.errors import ParamsError
 from reskin.schema import AXES_PER_CHIP_N
-from reskin.universal.law import Setup
+from reskin.universal.law import Law, Setup
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class BoardAxes:
     Parameters
     ----------
     setup : positions of the chips, nominal skin and tip
+    start : law at which fits start, and mean of the priors of their parameters
     turns_deg : rotation of each chip about z, relative to the board
     labels_middle_mm : label (x, y) of the board's middle
     labels_mirrored : whether y of the labels points opposite to y of the board
@@ -32,10 +34,18 @@ class BoardAxes:
     """
 
     setup: Setup
+    start: Law
     turns_deg: tuple[float, ...]
     labels_middle_mm: tuple[float, float]
     labels_mirrored: bool
     stated_by: str
+
+    @property
+    def nominal(self) -> Law:
+        """The law of the nominal skin, which does not slide and is as stiff as in simulated scenes (nominal.yaml)."""
+        design = self.setup.design
+        modulus_MPa = design.modulus_kPa * kilo / mega
+        return replace(self.start, modulus_MPa=modulus_MPa, stiffening=design.stiffening, away_um_mm=0.0)
 
     @cached_property
     def rotations(self) -> Float[np.ndarray, "k 3 3"]:

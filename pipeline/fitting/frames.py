@@ -16,7 +16,7 @@ from pipeline.fitting.axes import BoardAxes
 from pipeline.fitting.law_fit import AlignedPresses
 from pipeline.fitting.presses import pool, thin
 from reskin.schema import Readings
-from reskin.universal.law import nominal_uT
+from reskin.universal.law import simulate_uT
 
 # For each chip, a cosine tells how well the directions of the recorded and the simulated fields agree. An orientation
 # that differs from the stated one is reported only if it raises the sum of the chips' cosines by this much. The value
@@ -126,8 +126,9 @@ def frames_of(aligned: AlignedPresses, axes: BoardAxes) -> Frames:
     recorded = aligned.recorded
     force_N = recorded.force_N if recorded.forces_known else np.full(len(recorded), ASSUMED_N)
     return find_frames(
-        aligned.place_mm, recorded.db_uT, axes.rotations, lambda places_mm: nominal_uT(axes.setup, places_mm, force_N)
-    )
+        aligned.place_mm, recorded.db_uT, axes.rotations,
+        lambda places_mm: simulate_uT(axes.nominal, axes.setup, places_mm, force_N),
+    )  # fmt: skip
 
 
 def describe_outside(place_mm: Float[np.ndarray, "n 2"], axes: BoardAxes) -> str | None:

@@ -1,16 +1,16 @@
 """Fit the law of a skin (`reskin.universal.law`) to the recorded presses of one board."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from pipeline.fitting.presses import RecordedPresses, magnitudes_uT
-from reskin.universal.law import Law, Setup, at_rest_uT, simulate_uT, with_parameters
+from reskin.universal.law import Law, Setup, at_rest_uT, simulate_uT
 
 # Assumed values for fits. Each is a `Law` whose fields contain one number per parameter: in PRIOR the standard
-# deviation of the prior, whose mean is `Setup.start`; in STEP the typical size of a change of the parameter, by which
+# deviation of the prior (see `fit`); in STEP the typical size of a change of the parameter, by which
 # the optimiser scales the parameters.
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0, lets_go_N=8.0, stiffening=1.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0, lets_go_N=8.0, stiffening=1.0)
@@ -46,19 +46,19 @@ class AlignedPresses:
     rest_uT: Float[np.ndarray, "k 3"]
 
 
-def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law | None = None) -> Law:
+def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], mean: Law, start: Law | None = None) -> Law:
     """Fit the named parameters of the law to the presses on a board by least squares.
 
-    The fit starts at the law `start`, by default `setup.start`. All other parameters keep the values that they have in
-    this law.
+    `mean` contains the means of the priors. The fit starts at the law `start`, by default `mean`. All other parameters
+    keep the values that they have in this law.
     """
-    start = start or setup.start
+    start = start or mean
     magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)
-    centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (setup.start, PRIOR, STEP))
+    centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (mean, PRIOR, STEP))
 
     def residuals(values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
-        law = with_parameters(start, names, values)
+        law = replace(start, **dict(zip(names, values.tolist(), strict=True)))
         simulated_uT = simulate_uT(law, setup, presses.place_mm, presses.recorded.force_N)
         changes = (simulated_uT - presses.db_uT) / magnitude_uT[:, None, None]
         ratio = np.log(magnitudes_uT(simulated_uT) / magnitude_uT)
@@ -73,7 +73,7 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
     result = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )
-    return with_parameters(start, names, result.x)
+    return replace(start, **dict(zip(names, result.x.tolist(), strict=True)))
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:

@@ -1,11 +1,14 @@
 """How the recorded boards of a scene are oriented (section `compare` of the scene)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.fitting.axes import BoardAxes
 from pipeline.settings import Row, SectionWithRows, Settings
 from reskin.errors import ParamsError
 from reskin.universal.layout import BoardLayout, read_layout
+
+START_AWAY_um_mm = 5.0  # assumed slide of the law at which fits start
 
 
 class Compare(SectionWithRows):
@@ -32,6 +35,7 @@ class Compare(SectionWithRows):
     def axes(self) -> BoardAxes:
         """The orientation of the boards."""
         layout = self.layout
+        start = replace(layout.law, away_um_mm=START_AWAY_um_mm)
         return BoardAxes(
-            layout.setup(), layout.turns_deg, layout.centre_mm, self.labels_mirrored, f"layout {layout.name}"
+            layout.setup(), start, layout.turns_deg, layout.centre_mm, self.labels_mirrored, f"layout {layout.name}"
         )

@@ -4,7 +4,7 @@ The simulation has parameters, such as the gap between skin and chips, which dif
 N, unless a name states another one.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -108,26 +108,16 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """The properties that all boards of a scene share: nominal skin, positions of the chips, tip and area of presses.
-
-    `start_law` is the law at which fits start. It is also the mean of the priors of the fitted parameters. By default,
-    it is `START`.
-    """
+    """What all boards of a scene share: nominal skin, positions of the chips, tip and area of presses."""
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
-    gap_mm: float
     skin_mm: tuple[float, float]
     skin_flipped: bool  # whether all fields have the opposite sign, as if a checkerboard skin were turned by 90°
     tip_radius_mm: float
-    rule: Quadrature = RULE
-    coarse_rule: Quadrature = COARSE
-    area: Area = PAPER_AREA
-    start_law: Law | None = None
-
-    @property
-    def start(self) -> Law:
-        return self.start_law or START
+    rule: Quadrature
+    coarse_rule: Quadrature
+    area: Area
 
     @property
     def sides_m(self) -> tuple[float, float]:
@@ -149,7 +139,7 @@ class Setup:
             nodes.nodes_m, sign * magnet.moments(j_T, nodes.volumes_m3), self.thickness_m
         )
 
-    def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
+    def table(self) -> deformation.DeformationMap:
         """Tabulate the deformation of a skin that slips on its base.
 
         The table covers all depths up to `slide.DEEPEST` times the thickness.
@@ -157,7 +147,7 @@ class Setup:
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
         return deformation.tabulate(
-            self.thickness_m, tip_radius_mm * milli, deepest_m, heights=heights, base="slipping"
+            self.thickness_m, self.tip_radius_mm * milli, deepest_m, heights=heights, base="slipping"
         )
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
@@ -202,34 +192,17 @@ def simulate_uT(
     displacement_m = slide.press_displacement_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
     whole = slide.rigid_motion(places_m, displacement_m, setup.sides_m)
     slides = slide.limit_by_friction(whole, force_N, law.grip_N_mm * kilo)
-    table = setup.table(setup.tip_radius_mm)
-    change_T = _changes_T(rest or setup.rest, table, chips_m, places_m, depths_m, slides)
-    return law.amplitude * change_T @ turn.T / micro
+    table, rest = setup.table(), rest or setup.rest
+    changes_T = np.empty((len(places_m), *chips_m.shape))
+    for press_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
+        moved = deformation.move_dipoles(table, rest, np.append(place_m, depth_m))
+        slide.apply_in_place(slides, press_i, moved.after)
+        changes_T[press_i] = change_of_field(moved.before, moved.after, chips_m)
+    return law.amplitude * changes_T @ turn.T / micro
 
 
-def nominal_uT(
-    setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes of the nominal skin, which does not slide.
-
-    The depth of a press follows from its force according to `slide.force_at`.
-    """
-    depths_m = np.interp(force_N, *_nominal_curve(setup))
-    chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
-    still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
-    table = setup.table(setup.design.tip_radius_mm)
-    change_T = _changes_T(setup.rest, table, chips_m, place_mm * milli, depths_m, still)
-    return setup.start.amplitude * change_T / micro
-
-
-def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count the presses whose force is too large to be simulated with a law.
-
-    If `law` is None, the presses are counted whose force is too large for the nominal skin.
-    """
-    if law is None:
-        curve_N, _ = _nominal_curve(setup)
-        return int((force_N > curve_N[-1]).sum())
+def beyond_n(law: Law, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
+    """Count the presses whose force is too large to be simulated with a law."""
     return slide.count_clipped(force_N, **_layer(law, setup))
 
 
@@ -238,38 +211,3 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
         "modulus_Pa": law.modulus_MPa * mega, "thickness_m": setup.thickness_m,
         "tip_radius_m": setup.tip_radius_mm * milli, "stiffening": law.stiffening,
     }  # fmt: skip
-
-
-def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the force of the nominal skin as a function of depth, as an array of forces and an array of depths in m.
-
-    The last depth is the greatest one for which the deformation is tabulated.
-    """
-    curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
-    curve_N = slide.force_at(
-        curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
-        modulus_Pa=setup.design.modulus_kPa * kilo, stiffening=setup.design.stiffening,
-    )  # fmt: skip
-    return curve_N, curve_m
-
-
-def _changes_T(
-    rest: deformation.RestingDipoles, table: deformation.DeformationMap, chips_m: np.ndarray,
-    places_m: np.ndarray, depths_m: np.ndarray,
-    slides: slide.RigidMotion,
-) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
-    changes_T = np.empty((len(places_m), *chips_m.shape))
-    for press_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
-        moved = deformation.move_dipoles(table, rest, np.append(place_m, depth_m))
-        slide.apply_in_place(slides, press_i, moved.after)
-        changes_T[press_i] = change_of_field(moved.before, moved.after, chips_m)
-    return changes_T
-
-
-def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
-    """Return a copy of the law in which the named parameters have these values."""
-    return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
-
-
-# Law at which fits start by default; it is also the mean of the priors of the fitted parameters.
-START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)

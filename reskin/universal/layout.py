@@ -4,6 +4,7 @@ A user writes a layout as a YAML file. The file `reskin/layouts/reskin.yaml` is 
 """
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +24,7 @@ from reskin.physics.magnet import Polarity, Quadrature
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
 from reskin.simulation.defaults import filler
-from reskin.universal.law import COARSE, RULE, START, Area, Law, Length, Setup, with_parameters
+from reskin.universal.law import COARSE, RULE, Area, Law, Length, Setup
 from reskin.universal.population import NOMINAL, NOMINAL_SPREADS, THICKNESSES, TIPS, Forces
 
 CHIPS_APART_MM = 0.5  # smallest distance between the centres of two chips, which is less than the width of a chip
@@ -140,12 +141,8 @@ class BoardLayout(Strict):
 
         This is the nominal law with the gap, the magnetisation and the modulus of this layout.
         """
-        return with_parameters(NOMINAL, *self._own_parameters)
-
-    @property
-    def _own_parameters(self) -> tuple[tuple[str, ...], Float[np.ndarray, " p"]]:
-        own = {"gap_mm": self.gap_mm, "amplitude": self.skin.magnetisation, "modulus_MPa": self.skin.modulus_MPa}
-        return tuple(own), np.array(list(own.values()))
+        skin = self.skin
+        return replace(NOMINAL, gap_mm=self.gap_mm, amplitude=skin.magnetisation, modulus_MPa=skin.modulus_MPa)
 
     @property
     def all_spreads(self) -> dict[str, float]:
@@ -160,9 +157,8 @@ class BoardLayout(Strict):
         factor = max(1.0, max(self.skin.size_mm) / SIDE_MM)
         rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
         return Setup(
-            design, self.chips_mm, self.gap_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse,
-            self.area, with_parameters(START, *self._own_parameters),
-        )  # fmt: skip
+            design, self.chips_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse, self.area
+        )
 
     def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
         """Convert readings along the chips' axes to readings along the board's axes."""

@@ -24,7 +24,6 @@ from reskin.universal.law import (
     at_rest_uT,
     inside,
     simulate_uT,
-    with_parameters,
 )
 
 PLACES_N = 65  # number of places on the paper's grid
@@ -154,8 +153,8 @@ def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator
 
 def perturb(centre: Law, name: str, by: float) -> Law:
     """Add `by` to one parameter of a law, or to its logarithm if it is in `LOGARITHMIC`."""
-    value = asdict(centre)[name]
-    return with_parameters(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
+    value = getattr(centre, name)
+    return replace(centre, **{name: float(value * np.exp(by) if name in LOGARITHMIC else value + by)})
 
 
 def draw_skin(

@@ -55,7 +55,7 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_law_fitted_to_a_third_of_the_presses_agrees_with_all_presses(real):
     for pokes in real.values():
-        fitted = fit(AXES.align(thin(pokes, len(pokes) // 3)), SETUP, TEN)
+        fitted = fit(AXES.align(thin(pokes, len(pokes) // 3)), SETUP, TEN, AXES.start)
         presses = AXES.align(pokes)
         agreed = agreement(presses, simulate_uT(fitted, SETUP, presses.place_mm, presses.recorded.force_N))
         assert agreed["cosine_mean"] > 0.89

@@ -5,8 +5,8 @@ import numpy as np
 from pipeline.fitting.axes import BoardAxes
 from reskin.universal.layout import paper_layout
 
-SETUP = paper_layout().setup()
-AXES = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True, stated_by="a test")
+LAYOUT = paper_layout()
+AXES = BoardAxes(LAYOUT.setup(), LAYOUT.law, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True, stated_by="a test")
 
 
 def test_places_and_fields_are_converted_to_the_axes_of_the_board():

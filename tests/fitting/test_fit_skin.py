@@ -11,8 +11,8 @@ from tools import fit_skin
 
 def test_fit_finds_the_slide_and_the_amplitude_of_a_simulated_board(monkeypatch):
     monkeypatch.setattr(fit_skin, "FITS", {"linear": fit_skin.FITS["linear"]})
-    true = replace(TRUE, stiffening=0.0, modulus_MPa=0.4, gap_mm=AXES.setup.start.gap_mm, lets_go_N=6.0)
-    (found,) = fit_skin.fit_board(AXES.align(simulated_presses(true)), AXES.setup, draws_n=0)
+    true = replace(TRUE, stiffening=0.0, modulus_MPa=0.4, gap_mm=AXES.start.gap_mm, lets_go_N=6.0)
+    (found,) = fit_skin.fit_board(AXES.align(simulated_presses(true)), AXES, draws_n=0)
     assert found["presses_n"] == 50
     assert found["cosine"] > 0.99
     assert found["away_um_mm"] == pytest.approx(true.away_um_mm, abs=0.7)

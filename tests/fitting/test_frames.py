@@ -16,7 +16,7 @@ from reskin.errors import ParamsError
 from reskin.layouts import FOLDER
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
-from reskin.universal.law import nominal_uT
+from reskin.universal.law import simulate_uT
 from tests.data.tables import readings
 from tests.fitting.recorded import AXES, simulated_presses
 from tests.recordings.test_recordings import ingest
@@ -127,9 +127,8 @@ def square_axes() -> BoardAxes:
 def square_recording(axes: BoardAxes) -> Readings:
     """Return simulated presses at 5 x 5 places of the square board. Their forces are unknown."""
     place_mm = np.stack(np.meshgrid(*[np.linspace(-6, 6, 5)] * 2), axis=-1).reshape(-1, 2)
-    db_uT = np.einsum("kij,nki->nkj", axes.rotations, nominal_uT(axes.setup, place_mm, np.full(25, 2.0))).reshape(
-        25, 12
-    )
+    simulated_uT = simulate_uT(axes.nominal, axes.setup, place_mm, np.full(25, 2.0))
+    db_uT = np.einsum("kij,nki->nkj", axes.rotations, simulated_uT).reshape(25, 12)
     label_mm = axes.label(place_mm).astype(np.float32)
     return readings(
         "c", "b", "s", 25, indentation=np.arange(25, dtype=np.int32), x_mm=label_mm[:, 0], y_mm=label_mm[:, 1],
