@@ -42,7 +42,7 @@ from reskin.universal.calibration import (
 from reskin.universal.force import NORMAL_90, ForceHead, conformal
 from reskin.universal.layout import BoardLayout, as_layout, paper_layout
 from reskin.universal.likeness import PRESSES_MIN_N, Likeness
-from reskin.universal.network import Context, Labels, Normals, Weights
+from reskin.universal.network import Context, Normals, Weights
 
 # File of the model that comes with the project. Its model card, which describes the model, is universal.json.
 FILE = Path(__file__).with_name("universal.safetensors")
@@ -161,10 +161,7 @@ class Calibrated:
         return Normals(*(np.concatenate(values)[order] for values in zip(*(parts or [none]), strict=True)))
 
     def _read(self, labels: LabelledPresses) -> Context:
-        return network.read_skin(
-            self.weights, self.data.rest_uT, self.data.presses_uT, labels.db_uT,
-            Labels(labels.place_mm, labels.force_N), self.external_uT,
-        )  # fmt: skip
+        return network.read_skin(self.weights, replace(self.data, labels=labels), self.external_uT)
 
 
 @dataclass(frozen=True)

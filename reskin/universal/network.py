@@ -19,6 +19,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numba import njit
 
+from reskin.universal.calibration import SkinData
+
 WIDTH, HIDDEN, HEADS_N, LAYERS_N = 96, 288, 4, 3  # numbers of values in a token and in a hidden layer, heads, layers
 HEAD = WIDTH // HEADS_N
 LABEL_INPUTS_N, OUTPUTS_N = 5, 6
@@ -31,13 +33,6 @@ LOG_SD = (-5.0, 2.0)  # limits of the logarithm of the scaled standard deviation
 NORM_EPS = 1e-5  # is added to the variance in layer normalisations
 
 Weights = Mapping[str, np.ndarray]
-
-
-class Labels(NamedTuple):
-    """Places and forces of presses, relative to the centre of the board. A force that is not known is NaN."""
-
-    place_mm: Float[np.ndarray, "m 2"]
-    force_N: Float[np.ndarray, " m"]
 
 
 class Normals(NamedTuple):
@@ -125,32 +120,18 @@ def sign_of(weights: Weights, rest_uT: Float[np.ndarray, " ch"]) -> float:
     return -1.0 if float(rest_uT @ weights["usual_rest"]) < 0 else 1.0
 
 
-def read_skin(
-    weights: Weights,
-    rest_uT: Float[np.ndarray, " ch"],
-    unlabelled_uT: Float[np.ndarray, "u ch"],
-    labelled_uT: Float[np.ndarray, "m ch"],
-    labels: Labels,
-    external_uT: float = 0.0,
-) -> Context:
-    """Compute the context of a skin from its no-load field and the field changes of its presses.
+def read_skin(weights: Weights, data: SkinData, external_uT: float = 0.0) -> Context:
+    """Compute the context of a skin from its no-load field and its presses.
 
-    All fields are along the axes of the board.
-
-    Parameters
-    ----------
-    weights : weights of the network
-    rest_uT : no-load field
-    unlabelled_uT, labelled_uT : field changes of presses at unknown and at known places; there may be none of them
-    labels : places and forces of the labelled presses
-    external_uT : standard deviation of external fields that readings contain
+    `external_uT` is the standard deviation of external fields that readings contain.
     """
+    rest_uT, labels = data.rest_uT, data.labels
     sign = sign_of(weights, rest_uT)
     weight, bias = _linear(weights, "embed1")
     own_n = len(rest_uT) + 1  # the first inputs are those of a press
     ambient = np.append(sign * rest_uT / REST_uT, math.log1p(external_uT / EXTERNAL_uT))
     shared = weight[:, own_n:] @ ambient + bias
-    db_uT = sign * np.concatenate([labelled_uT, unlabelled_uT])
+    db_uT = sign * np.concatenate([labels.db_uT, data.presses_uT])
     length_uT = np.maximum(np.linalg.norm(db_uT, axis=1, keepdims=True), LENGTH_MIN_uT)
     inputs = np.hstack([DIRECTION_GAIN * db_uT / length_uT, np.log(length_uT) - LOG_uT])
     tokens = _apply(weights, "embed2", _bend(inputs @ weight[:, :own_n].T + shared))
