@@ -4,8 +4,10 @@ The networks receive the change of the field since a no-load reading (a reading 
 when a new no-load reading is taken. Separate networks are trained for each policy.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -23,7 +25,7 @@ from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs
-from reskin.data.baseline import alike_within_uT, free, rank
+from reskin.data.baseline import rank
 from reskin.data.rows import Selection, contacts, gather
 from reskin.data.splits import NO_POOL, Fold
 from reskin.errors import ParamsError
@@ -34,6 +36,11 @@ from reskin.schema import LABELS, Readings
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of the force in a target (x_mm, y_mm, F_N)
 POINTS_MAX_N = 2000  # largest number of points in the scatter plot
+# Constants of policy `free`: number of latest states with which a reading is compared (usually, five of them are
+# contacts and five are not), how many of them must be alike, and the distance of readings that are alike, as a multiple
+# of the median distance between the no-load readings of successive indentations. They were chosen on all passes of the
+# recording of scene `eflesh`, which can therefore not be used to test them.
+STATES_N, ALIKE_MIN_N, ALIKE_FACTOR = 10, 4, 2.0
 DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 ERRORS = ["mse_xy_mm2", "mse_f_N2"]
 NETWORK = ["board", "skin", "seed"]  # columns that identify a network of one policy
@@ -211,8 +218,49 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> Floa
             return noload_uT
         case "free":
             early = unit(readings, section) < section.train_n
-            within_uT = alike_within_uT(noload_uT[early], readings.indentation[early])
-            return free(readings.b_uT, noload_uT, readings.indentation, within_uT=within_uT)
+            return free_field(readings, alike_within_uT(take(readings, early)))
+
+
+def alike_within_uT(early: Readings) -> float:
+    """Return the distance in uT below which two readings are alike, from the first readings of a capture."""
+    noload_uT = early.noload_uT[first_rows(early)].astype(float)
+    return ALIKE_FACTOR * float(np.median([_distance_uT(a, b) for a, b in pairwise(noload_uT)]))
+
+
+def free_field(readings: Readings, within_uT: float) -> Float32[np.ndarray, "f ch"]:
+    """Return, for each reading, the latest earlier reading that `follow_free` judges to be free of contact."""
+    # The readings in the order in which a board sends them: the no-load reading of each indentation is before its rows.
+    first = first_rows(readings)
+    sent_uT = np.insert(readings.b_uT, first, readings.noload_uT[first], axis=0)
+    followed_uT = np.stack(list(follow_free(sent_uT, within_uT)))
+    return followed_uT[np.arange(len(readings)) + rank(readings.indentation)]
+
+
+def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Float32[np.ndarray, " ch"]]:
+    """Yield, after each reading, the latest reading that was probably free of contact.
+
+    This is judged from the readings alone: different presses give different readings, but all readings without contact
+    are alike, which means that their distance is below `within_uT`. Consecutive readings that are alike, such as those
+    of a press that is held, form one state, however long it lasts. A state is free of contact if at least `ALIKE_MIN_N`
+    of the latest `STATES_N` states are alike, including the state itself. During a long contact, such as that of a
+    sliding finger, the result does not change. The first reading must be free of contact.
+    """
+    states: deque[np.ndarray] = deque(maxlen=STATES_N)
+    free_uT: np.ndarray | None = None
+    for reading in readings:
+        if states and _distance_uT(states[-1], reading) < within_uT:
+            states[-1] = reading
+        else:
+            states.append(reading)
+        alike_n = sum(_distance_uT(state, reading) < within_uT for state in states)
+        if free_uT is None or alike_n >= ALIKE_MIN_N:
+            free_uT = reading
+        yield free_uT
+
+
+def _distance_uT(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the distance of two readings: the root mean square of their difference over the channels."""
+    return float(np.sqrt(np.mean((a - b) ** 2)))
 
 
 def late_window(series: Sequence[Sequence[Window]], section: Drift) -> tuple[PolicyName, int]:

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from scipy.stats import linregress, sem
 
 from pipeline.experiments import drift as experiment
-from pipeline.experiments.drift import Drift, cut, figures, force_left_pct, run, summarise
+from pipeline.experiments.drift import Drift, cut, figures, force_left_pct, run, summarise, take
 from pipeline.scores import make_table
 from pipeline.settings import Settings, read_shared_files
 from reskin.data.grid import points_mm
@@ -103,6 +103,46 @@ def test_windows_and_no_load_fields_equal_those_of_a_loop(runs_n, train_n, test_
             assert window.noload_off_uT == pytest.approx(np.sqrt(np.mean(np.square(off_uT, dtype=float))))
             used += window.readings.indentation.tolist()
         assert len(set(used)) == sum(lengths)  # no press is in two windows
+
+
+def make_touches(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> Readings:
+    """Return readings with a field that differs between touches, and a no-load field that drifts at random.
+
+    A touch has `rows_n` readings.
+    """
+    rng = rng_for(0, "touched")
+    rest_uT = np.cumsum(walk_uT * rng.standard_normal((touches_n, 15)), axis=0)
+    touch_uT = 60 * rng.standard_normal((touches_n, 15))
+    indentation = np.repeat(np.arange(touches_n, dtype=np.int32), rows_n)
+    noload_uT = rest_uT[indentation].astype(np.float32)
+    b_uT = noload_uT + touch_uT[indentation].astype(np.float32)
+    return readings(f=len(b_uT), indentation=indentation, b_uT=b_uT, noload_uT=noload_uT)
+
+
+@pytest.mark.parametrize("rows_n", [1, 4, 50])
+def test_no_load_field_that_is_judged_from_readings_follows_the_drift(rows_n):
+    touches = make_touches(rows_n)
+    within_uT = experiment.alike_within_uT(take(touches, touches.indentation < 20))
+    assert within_uT == pytest.approx(2.0, rel=0.2)
+    off_uT = experiment.free_field(touches, within_uT) - touches.noload_uT
+    # The result is usually less than one touch old, and occasionally one or two touches.
+    assert np.sqrt((off_uT**2).mean()) < 0.7
+    assert np.sqrt(((touches.noload_uT[0] - touches.noload_uT) ** 2).mean()) > 5
+
+
+def test_no_load_reading_is_not_replaced_during_a_long_slide():
+    touches = make_touches(1, walk_uT=0.1)
+    sent = [field for pair in zip(touches.noload_uT, touches.b_uT, strict=True) for field in pair]
+    slid = [*sent[:100], *(sent[101] + 20 * i for i in range(60)), *sent[100:]]
+    found = list(experiment.follow_free(slid, within_uT=0.5))
+    np.testing.assert_array_equal(found[159], sent[98])
+    np.testing.assert_array_equal(found[-1], sent[-2])
+
+
+def test_no_load_field_that_is_judged_from_readings_does_not_depend_on_later_readings():
+    touches = make_touches(2)
+    whole, part = (experiment.free_field(take(touches, np.arange(400) < n), 2.0) for n in (400, 123))
+    np.testing.assert_array_equal(whole[:123], part)
 
 
 @pytest.mark.parametrize(
