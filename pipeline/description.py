@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, Shaped
 
 from pipeline.statistics import summarise
 from reskin.board.faults import find_lsb
-from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
@@ -27,7 +26,7 @@ def describe(readings: Readings) -> dict[str, float]:
     """Summarise the readings of one capture: values by quantity; quantities with too few readings are omitted."""
     # A reading with a force but without a place is not a contact. A reading without either is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
-    change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
+    change_uT = readings.db_uT.astype(np.float64)
     return {
         **_rest(readings.noload_uT),
         **_wander(readings),
@@ -62,6 +61,15 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
     summary = summarise(skins)
     return {name: stat.to_json() | {"least": float(skins[name].min()), "most": float(skins[name].max())}
             for name, stat in summary.items()}  # fmt: skip
+
+
+def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
+    """Number the runs of equal labels, and return the number of its run for each row.
+
+    A run consists of successive rows with the same label. Runs are numbered from 0. `label` is, for example, the
+    indentation or the pass of each row of a capture, in order of time.
+    """
+    return np.cumsum(np.concatenate([[0], label[1:] != label[:-1]])).astype(np.int64)[: len(label)]
 
 
 def first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:

@@ -74,6 +74,11 @@ class Readings:
     def chips_n(self) -> int:
         return self.b_uT.shape[1] // AXES_PER_CHIP_N
 
+    @property
+    def db_uT(self) -> Float32[np.ndarray, "f ch"]:
+        """The field change relative to the no-load reading (paper section 4)."""
+        return self.b_uT - self.noload_uT
+
 
 LABELS = ("capture", "board", "skin", "source")
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.description import describe, over_skins
+from pipeline.description import describe, over_skins, rank
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
@@ -92,3 +92,8 @@ def test_largest_force_of_a_skin_is_the_largest_of_all_its_captures():
     summary = over_skins([("s0", {"force_max_N": 2.0}), ("s0", {"force_max_N": 6.0}), ("s1", {"force_max_N": 3.0})])
     assert summary["force_max_N"]["most"] == 6
     assert summary["force_max_N"]["mean"] == 4.5
+
+
+def test_rank_numbers_indentations_in_their_order_in_time():
+    assert rank(np.array([5, 5, 2, 9, 9])).tolist() == [0, 0, 1, 2, 2]
+    assert rank(np.zeros(0, np.int32)).tolist() == []

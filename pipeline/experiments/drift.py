@@ -18,14 +18,13 @@ from jaxtyping import Bool, Float32, Int64
 from pydantic import Field, model_validator
 
 from pipeline import statistics
-from pipeline.description import first_rows, rms
+from pipeline.description import first_rows, rank, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import COLUMNS, show_difference
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs
-from reskin.data.baseline import rank
 from reskin.data.rows import Selection, contacts, gather
 from reskin.data.splits import NO_POOL, Fold
 from reskin.errors import ParamsError

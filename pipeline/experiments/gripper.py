@@ -21,7 +21,6 @@ from pipeline.simulation import load_protocol
 from pipeline.stage import say
 from pipeline.statistics import add_seed_sd, summarise
 from reskin.config import Strict
-from reskin.data.baseline import subtract
 from reskin.data.contact import CONTACT_SDS
 from reskin.data.grid import CENTRE_MM
 from reskin.models.trained import networks_held_out
@@ -115,7 +114,7 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
     The noise is the standard deviation of single readings from these averages.
     """
-    change_uT = subtract(capture.b_uT, capture.noload_uT)
+    change_uT = capture.db_uT
     levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
     ).astype(np.float64)

@@ -15,7 +15,6 @@ from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
 from pipeline.stage import say
-from reskin.data.baseline import subtract
 from reskin.simulation.protocols import load_steps_N
 
 # A weight difference is resolved if, in at least this fraction of pairs of readings, the reading under the larger
@@ -133,7 +132,7 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     load = load_protocol(settings, "glass")
     capture = only(read_captures(indentations), indentations)
     weight_N = load_steps_N(load.force_max_N, load.step_N)
-    change_uT = subtract(capture.b_uT, capture.noload_uT)
+    change_uT = capture.db_uT
     levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
     )

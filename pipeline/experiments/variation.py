@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.description import rms
+from pipeline.description import rank, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.plot import drawing, svg
 from pipeline.settings import Settings
 from reskin import io
 from reskin.config import Strict
-from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
@@ -82,12 +81,11 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
         what = f"{place} is never pressed to a depth of {depth_mm:g} mm (variation.depth_mm)"
         where = f"experiment variation, capture {readings.capture}"
         raise ParamsError(f"{where}: {what}. {_visited(readings, place_mm)}")
-    b_uT = readings.b_uT[selected]
     visit_i, n_contacts = rank(readings.indentation[selected]), readings.n_contacts[selected]
     _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
     means = [
         np.add.reduceat(values, first_i, axis=0, dtype=np.float64) / n[:, None]
-        for values in (b_uT, subtract(b_uT, readings.noload_uT[selected]))
+        for values in (readings.b_uT[selected], readings.db_uT[selected])
     ]
     return Visits(n_contacts[first_i], *means)
 

@@ -12,7 +12,6 @@ from functools import reduce
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from reskin.data.baseline import subtract
 from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
@@ -92,7 +91,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
                 capture=np.repeat(readings.capture, f),
                 board=np.repeat(readings.board, f),
                 skin=np.repeat(readings.skin, f),
-                db_uT=subtract(readings.b_uT, readings.noload_uT),
+                db_uT=readings.db_uT,
                 target=np.full((f, len(TARGETS)), np.nan, np.float32),
                 pass_i=readings.pass_i,
                 indentation=readings.indentation.astype(np.int64),

@@ -12,7 +12,6 @@ from jaxtyping import Float32, Int32, Int64
 
 from reskin import io
 from reskin.config import Strict
-from reskin.data.baseline import subtract
 from reskin.display import one_line
 from reskin.errors import ParamsError
 from reskin.schema import Readings
@@ -112,7 +111,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
         capture=np.repeat(np.array([readings.capture for readings in captures]), kept_n),
         board=np.repeat(np.array([readings.board for readings in captures]), kept_n),
         skin=np.repeat(np.array([readings.skin for readings in captures]), kept_n),
-        db_uT=np.concatenate([subtract(readings.b_uT[keep], readings.noload_uT[keep]) for readings, keep in pairs]),
+        db_uT=np.concatenate([readings.db_uT[keep] for readings, keep in pairs]),
         target=np.concatenate(columns),
         pass_i=np.concatenate(pass_i),
         indentation=_number_consecutively([readings.indentation[keep] for readings, keep in pairs]),
