@@ -5,7 +5,7 @@ that were adapted with the same number of robot pokes, and with a control: netwo
 same number of steps, but without pokes of the skin.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,12 +38,13 @@ from pipeline.training.variants import (  # fmt: skip
     score_variants,
     summarise_variants,
 )
-from reskin.data.lines import Lines, hand_rows, shift_rows
-from reskin.data.rows import stack
+from reskin.data.lines import Lines, hand_lines
+from reskin.data.rows import TARGETS, Rows, stack
 from reskin.data.splits import Fold
-from reskin.errors import SchemaError
+from reskin.errors import ParamsError, SchemaError
 from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
+from reskin.schema import Readings
 
 GRID = "grid"  # name of the variant that is adapted with equally many robot pokes instead of hand pokes
 
@@ -56,13 +57,13 @@ def manual(
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)
     adapting = data.settings.section(Adaptations, "adapt")
-    poked, lines_by_skin = hand_rows(read_captures(indentations))
-    lines = {skin: shift_rows(skin_lines, len(data.rows)) for skin, skin_lines in lines_by_skin.items()}
-    data = replace(data, rows=stack(data.rows, poked))
+    captures = read_captures(indentations)
+    rows, lines = add_hand_pokes(data.rows, captures)
+    data = replace(data, rows=rows)
     jobs: list[tuple[str, TrainingJob]] = []
     predictions: list[VariantPrediction] = []
-    for skin, skin_lines in lines.items():
-        fold = fold_without(data, str(poked.board[poked.skin == skin][0]))
+    for capture in captures:
+        skin, skin_lines, fold = capture.skin, lines[capture.skin], fold_without(data, capture.board)
         predictions += predict_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
         jobs += make_jobs(data, fold, adapting, starts, skin, skin_lines)
     after, trainings = adapt_and_predict(data, jobs, "manual")
@@ -70,7 +71,33 @@ def manual(
     lines_n = [len(np.unique(skin_lines.line_i)) for skin_lines in lines.values()]
     write_scores(scores, score_variants("manual", [*predictions, *after]))
     numbers = {"pokes_n": round(np.mean(pokes_n)), "lines_n": round(np.mean(lines_n))}
-    write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
+    write_results(results, numbers, {}, read_losses(indentations, {}), trainings)
+
+
+def add_hand_pokes(rows: Rows, captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
+    """Append the readings of captures of hand pokes to rows, and return them with the lines of each skin.
+
+    The places and forces of the appended rows are unknown (NaN).
+    """
+    lines: dict[str, Lines] = {}
+    for readings in captures:
+        if readings.skin in lines:
+            what = f"skin {readings.skin} also has manual pokes in another capture"
+            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two captures from the scene.")
+        in_capture, f = hand_lines(readings.pass_i, readings.indentation), len(readings)
+        lines[readings.skin] = replace(in_capture, row=in_capture.row + len(rows))
+        poked = Rows(
+            capture=np.repeat(readings.capture, f),
+            board=np.repeat(readings.board, f),
+            skin=np.repeat(readings.skin, f),
+            db_uT=readings.db_uT,
+            target=np.full((f, len(TARGETS)), np.nan, np.float32),
+            pass_i=readings.pass_i,
+            indentation=readings.indentation.astype(np.int64),
+            dropped={},
+        )
+        rows = stack(rows, poked)
+    return rows, lines
 
 
 def make_jobs(

@@ -5,16 +5,13 @@ index these points". For pokes that a robot has made on a grid, the index of a p
 place. The places are then discarded, so that `Lines` contains only row numbers, line numbers and indices.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import reduce
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from reskin.data.rows import TARGETS, Rows, stack
+from reskin.data.rows import TARGETS, Rows
 from reskin.errors import ParamsError
-from reskin.schema import Readings
 
 PLACE_STEP_MM = 0.1  # two places are assumed to be the same if their coordinates, rounded to this step, are equal
 PLACES_MIN_N = 2  # smallest number of places on a line, because a line with a single place has no order
@@ -70,43 +67,6 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
     for line in np.unique(pass_i):
         order_i[pass_i == line] -= order_i[pass_i == line].min()
     return _number(np.arange(len(pass_i)), pass_i[:, None].astype(np.int64), order_i)
-
-
-def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
-    """Stack the readings of captures of manual pokes, and assign them to lines.
-
-    Returns the rows, whose places and forces are unknown (NaN), and a mapping from each skin's name to its lines. The
-    row numbers in the lines refer to the returned rows.
-    """
-    parts: list[Rows] = []
-    lines: dict[str, Lines] = {}
-    for readings in captures:
-        if readings.skin in lines:
-            what = f"skin {readings.skin} also has manual pokes in another capture"
-            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two captures from the scene.")
-        lines[readings.skin] = shift_rows(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
-        f = len(readings)
-        parts.append(
-            Rows(
-                capture=np.repeat(readings.capture, f),
-                board=np.repeat(readings.board, f),
-                skin=np.repeat(readings.skin, f),
-                db_uT=readings.db_uT,
-                target=np.full((f, len(TARGETS)), np.nan, np.float32),
-                pass_i=readings.pass_i,
-                indentation=readings.indentation.astype(np.int64),
-                dropped={},
-            )
-        )
-    return reduce(stack, parts), lines
-
-
-def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Increase the row numbers in `lines` by `rows_n`.
-
-    This is needed if the rows to which `lines` refers have been appended to `rows_n` other rows.
-    """
-    return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(

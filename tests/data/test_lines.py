@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.data.grid import points_mm, protocol
-from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, take_pokes
+from reskin.data.lines import Lines, grid_lines, hand_lines, take_pokes
 from reskin.data.rows import Rows, Selection, gather, stack
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
@@ -157,13 +157,6 @@ def test_take_pokes_raises_if_the_pool_contains_several_skins():
 
 
 ALL_READINGS = Selection(force_min_N=0.0)
-UNKNOWN = np.full(6, np.nan, np.float32)
-
-
-def hand_readings(skin: str = "s0", **changes: object):
-    pressed = {"indentation": np.repeat(np.arange(3, dtype=np.int32), 2), "pass_i": np.zeros(6, np.int32)}
-    unknown = {"x_mm": UNKNOWN, "y_mm": UNKNOWN, "depth_mm": UNKNOWN, "Fz_N": UNKNOWN}
-    return readings(f"{skin}-hand", "b0", skin, **(pressed | unknown | changes))
 
 
 @given(st.integers(2, 12), st.integers(2, 12))
@@ -182,18 +175,8 @@ def test_stacked_tables_keep_their_rows_and_get_new_indentation_numbers(above_n,
     assert len({*both.indentation[above_n:]}) == len({*below.indentation})
 
 
-def test_hand_pokes_have_fields_but_no_labels():
-    rows, _ = hand_rows([hand_readings("s0"), hand_readings("s1")])
-    assert len(rows) == 12
-    assert np.isnan(rows.target).all()
-    assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5] * 2
-    assert len({*rows.indentation}) == 6
-
-
-def test_stacking_raises_if_channels_differ_or_a_skin_occurs_twice():
+def test_stacking_raises_if_channels_differ():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], ALL_READINGS)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
         stack(gather([readings("c0")], ALL_READINGS), other)
-    with pytest.raises(ParamsError, match="skin s0 also has manual pokes in another capture"):
-        hand_rows([hand_readings("s0"), hand_readings("s0")])

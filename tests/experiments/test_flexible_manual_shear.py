@@ -10,7 +10,7 @@ from sklearn.metrics import mean_squared_error, r2_score
 
 from pipeline.experiments import shear
 from pipeline.experiments.flexible import sizes_by_depth, strength_ratio
-from pipeline.experiments.manual import GRID
+from pipeline.experiments.manual import GRID, add_hand_pokes
 from pipeline.scores import by_skin, make_table, rows_of_cards
 from pipeline.statistics import Stat, paired
 from pipeline.training.variants import (
@@ -22,6 +22,8 @@ from pipeline.training.variants import (
     score_variants,
     summarise_variants,
 )
+from reskin.data.rows import Selection, gather
+from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score, score_groups, score_shear
 from reskin.seeds import rng_for
 from tests.data.tables import readings
@@ -86,6 +88,28 @@ def test_differences_equal_those_computed_from_model_cards():
     after, before = (by_skin(rows_of_cards(cards[variant])) for variant in (AFTER, BEFORE))
     result = compare_variants(TABLE, AFTER, BEFORE)
     assert result | {name: replace(result[name], sd_seeds=None) for name in METRICS} == paired(after, before)
+
+
+def hand_readings(skin: str):
+    press, unknown = np.repeat(np.arange(3, dtype=np.int32), 2), np.full(6, np.nan, np.float32)
+    return readings(
+        f"{skin}-hand", "b0", skin, indentation=press, pass_i=np.zeros(6, np.int32), x_mm=unknown, y_mm=unknown,
+        Fz_N=unknown,
+    )  # fmt: skip
+
+
+def test_hand_pokes_are_appended_with_fields_and_lines_but_without_labels():
+    grid = gather([readings()], Selection(force_min_N=0.0))
+    rows, lines = add_hand_pokes(grid, [hand_readings("s1"), hand_readings("s2")])
+    assert len(rows) == 6 + 12
+    assert np.isnan(rows.target[6:]).all()
+    assert rows.db_uT[6:, 0].tolist() == [0, 1, 2, 3, 4, 5] * 2
+    assert len({*rows.indentation}) == 6 + 6
+    for skin, first in (("s1", 6), ("s2", 12)):
+        assert lines[skin].row.tolist() == list(range(first, first + 6))
+        assert lines[skin].order_i.tolist() == [0, 0, 1, 1, 2, 2]
+    with pytest.raises(ParamsError, match="skin s1 also has manual pokes in another capture"):
+        add_hand_pokes(grid, [hand_readings("s1"), hand_readings("s1")])
 
 
 @given(st.floats(0.5, 3))
