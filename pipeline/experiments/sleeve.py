@@ -21,12 +21,12 @@ from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic, tally
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs
+from pipeline.training.neighbours import predict_by_neighbours
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, TRUTH, score
 from reskin.models.inputs import VIEW
 from reskin.models.job import TrainingJob
-from reskin.models.neighbours import fit_neighbours
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
@@ -77,7 +77,11 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, scores: Path
         name: [result.predicted for job, result in zip(jobs, trained, strict=True) if job.recipe_name == name]
         for name in section.training.recipes
     }
-    predictions |= predict_by_neighbours(data, section, train, test)
+    target = data.rows.target[train]
+    for name in ("raw", "shape"):  # of dB
+        trained_on, tested = (VIEW[name](data.rows.db_uT[rows]) for rows in (train, test))
+        predicted = predict_by_neighbours(trained_on, target, tested, section.neighbours_n)
+        predictions[f"knn-{name}"] = [predicted]
     true, indentation = data.rows.target[test], data.rows.indentation[test]
     near = area.near_border(true[:, :2])
     scored = [
@@ -139,21 +143,6 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
             raise ParamsError(f"experiment sleeve: {what}, {rule}. {remedy}")
         held_out |= in_capture & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
-
-
-def predict_by_neighbours(
-    data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray
-) -> dict[str, list[np.ndarray]]:
-    """Predict the test rows by k nearest neighbours.
-
-    The inputs are either dB (key `knn-raw` of the result) or the shape of dB (key `knn-shape`).
-    """
-    predictions = {}
-    for name in ("raw", "shape"):
-        trained_on, tested = (VIEW[name](data.rows.db_uT[rows]) for rows in (train, test))
-        fitted = fit_neighbours(trained_on, data.rows.target[train], section.neighbours_n)
-        predictions[f"knn-{name}"] = [fitted.predict(tested)]
-    return predictions
 
 
 def rate_hz(captures: Sequence[Readings]) -> float:

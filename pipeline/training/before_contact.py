@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from pipeline.training.jobs import SceneData
+from pipeline.training.neighbours import predict_by_neighbours
 from reskin import io
 from reskin.data.rows import Selection, contacts
 from reskin.data.splits import SAME_SKIN, Fold
 from reskin.metrics import score
-from reskin.models.neighbours import fit_neighbours
 from reskin.models.trained import Network
 from reskin.schema import Readings
 
@@ -140,8 +140,8 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     if not in_test_passes.any():
         return []
     db_uT, place_mm = hover.db_uT[in_test_passes], hover.place_mm[in_test_passes]
-    neighbours = fit_neighbours(rows.db_uT[fold.train], rows.target[fold.train], NEIGHBOURS_N)
-    predictions = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
+    by_neighbours = predict_by_neighbours(rows.db_uT[fold.train], rows.target[fold.train], db_uT, NEIGHBOURS_N)
+    predictions = {"hover": [by_neighbours], "hover_network": [network(db_uT) for network in networks]}
     force_N = rows.target[fold.test, 2]
     touch_uT = np.linalg.norm(rows.db_uT[fold.test][(force_N > TOUCH_N[0]) & (force_N < TOUCH_N[1])], axis=1)
     magnitudes = {"hover_uT": float(np.median(np.linalg.norm(db_uT, axis=1))), "touch_uT": float(np.median(touch_uT))}
@@ -159,6 +159,6 @@ def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> dict[str, float]:
     """Train nearest neighbours on inputs without the contact's signal, and score the places predicted for test rows."""
-    fitted = fit_neighbours(inputs[train], data.rows.target[train], NEIGHBOURS_N)
-    scores = score(data.rows.target[test], fitted.predict(inputs[test]))
+    predicted = predict_by_neighbours(inputs[train], data.rows.target[train], inputs[test], NEIGHBOURS_N)
+    scores = score(data.rows.target[test], predicted)
     return {name: scores[name] for name in PLACE}
