@@ -4,6 +4,7 @@
 """
 
 import re
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -36,14 +37,97 @@ PLATEAU = 0.8
 PRESS_READINGS_MAX_N = 20_000
 
 
-class Presses:
-    """The presses that are collected for a calibration. For each press, the largest field change is stored."""
+@dataclass(frozen=True)
+class LabelledPress:
+    """A press whose place is known, and perhaps its force."""
+
+    label: Label
+    rest_s: tuple[float, float]  # start and end of the no-load dwell before the press
+    held_s: tuple[float, float]  # start and end of the time in which the press was held
+    db_uT: Float64[np.ndarray, " ch"]  # mean field change while the press was held
+
+
+@dataclass(frozen=True)
+class Press:
+    """The n readings of a contact that has ended."""
+
+    t_s: Float64[np.ndarray, " n"]
+    db_uT: Float64[np.ndarray, "n ch"]
+    # times of the first and the last reading without contact before the press; None if there is no such reading
+    before_s: tuple[float, float] | None
+
+    @property
+    def strongest_uT(self) -> Float64[np.ndarray, " ch"]:
+        """The largest field change."""
+        return self.db_uT[np.linalg.norm(self.db_uT, axis=1).argmax()]
+
+    def label(self, label: Label) -> LabelledPress:
+        """Find the time in which the press was held, and the no-load dwell before it.
+
+        Raises CaptureError with a text for the user if the press cannot be used with a label.
+        """
+        if self.before_s is None:
+            raise CaptureError("the press had begun before the label was entered; lift, then press again")
+        rest_end_s = self.before_s[1] - APPROACH_S
+        rest_start_s = max(self.before_s[0] + RECOVERY_S, rest_end_s - REST_MAX_S)
+        if rest_end_s - rest_start_s < REST_MIN_S:
+            raise CaptureError("the skin was touched shortly before the press; lift for a second, then press again")
+        size_uT = np.linalg.norm(self.db_uT, axis=1)
+        held = np.flatnonzero(size_uT >= PLATEAU * size_uT.max())
+        first, last = held[0], held[-1]
+        if self.t_s[last] - self.t_s[first] < DWELL_MIN_s:
+            raise CaptureError("the press was too short; press again, and hold the press for half a second")
+        held_s = (float(self.t_s[first]), float(self.t_s[last]))
+        return LabelledPress(label, (rest_start_s, rest_end_s), held_s, self.db_uT[first : last + 1].mean(axis=0))
+
+
+class PressFinder:
+    """Finds the presses in a stream of estimates."""
+
+    def __init__(self) -> None:
+        self._before_s: tuple[float, float] | None = None
+        self._contact: list[tuple[float, Float64[np.ndarray, " ch"]]] = []  # readings of the contact in progress
+
+    def add(self, estimates: Estimates) -> list[Press]:
+        """Add the next readings; return the presses that have ended.
+
+        Faulty readings, which are NaN, are skipped and do not end a press.
+        """
+        presses = []
+        known = np.isfinite(estimates.db_uT).all(axis=1)
+        readings = zip(estimates.t_s[known].tolist(), estimates.db_uT[known], estimates.contact[known], strict=True)
+        for t_s, db_uT, contact in readings:
+            if contact:
+                if len(self._contact) < PRESS_READINGS_MAX_N:
+                    self._contact.append((t_s, db_uT.astype(np.float64)))
+            elif self._contact:
+                times_s, changes_uT = zip(*self._contact, strict=True)
+                presses.append(Press(np.array(times_s), np.array(changes_uT), self._before_s))
+                self._before_s, self._contact = (t_s, t_s), []
+            else:
+                self._before_s = (self._before_s[0] if self._before_s else t_s, t_s)
+        return presses
+
+
+class NextPress(PressFinder):
+    """Waits for the next press, for which the user has entered a label.
+
+    If `learn` is set, the model is calibrated to the press.
+    """
+
+    def __init__(self, label: Label, *, learn: bool) -> None:
+        super().__init__()
+        self.label, self.learn = label, learn
+        self.problem = ""  # text for the user that states why the latest press was not accepted
+
+
+class Presses(PressFinder):
+    """Collects presses for a calibration. For each press, the largest field change is stored."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
+        super().__init__()
         self.presses_n = presses_n
         self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
-        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change of the contact in progress
-        self._readings_n = 0
 
     def __len__(self) -> int:
         return len(self._strongest_uT)
@@ -66,22 +150,16 @@ class Presses:
     def db_uT(self) -> Float64[np.ndarray, "n ch"]:
         return np.array(self._strongest_uT)
 
-    def add(self, estimates: Estimates) -> None:
-        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a contact."""
-        known = np.isfinite(estimates.db_uT).all(axis=1)
-        for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
-            if contact:
-                self._readings_n += 1
-                if self._current_uT is None or np.linalg.norm(db_uT) > np.linalg.norm(self._current_uT):
-                    self._current_uT = db_uT
-                continue
-            if self._current_uT is not None and self._readings_n >= READINGS_MIN_N and not self.complete:
-                self._strongest_uT.append(self._current_uT)
-            self._current_uT, self._readings_n = None, 0
+    def add(self, estimates: Estimates) -> list[Press]:
+        """Add the next readings; return the presses that were collected."""
+        presses = [press for press in super().add(estimates) if len(press.t_s) >= READINGS_MIN_N]
+        presses = presses[: self.presses_n - len(self)]
+        self._strongest_uT += [press.strongest_uT for press in presses]
+        return presses
 
 
 class GuidedPresses(Presses):
-    """The presses that are collected at places of a grid. The page shows these places one by one in random order.
+    """Collects presses at places of a grid. The page shows these places one by one in random order.
 
     Every second press is held out: it is not used for the calibration, but to measure the error of the calibrated
     model.
@@ -106,65 +184,6 @@ class GuidedPresses(Presses):
     @property
     def held_out(self) -> Bool[np.ndarray, " n"]:
         return np.arange(self.presses_n) % 2 == 1
-
-
-class LabelledPress:
-    """The next press in a stream of estimates, for which the place and the force are known.
-
-    The object receives the estimates and finds the time in which the press is held, and the no-load dwell before the
-    press.
-
-    If `learn` is set, the model is calibrated to the press.
-    """
-
-    def __init__(self, label: Label, *, learn: bool) -> None:
-        self.label, self.learn = label, learn
-        self.problem = ""  # text for the user that states why the latest press was not accepted
-        self.rest_s: tuple[float, float] | None = None  # start and end of the no-load dwell before the press
-        self.held_s: tuple[float, float] | None = None  # start and end of the time in which the press was held
-        self.db_uT: Float64[np.ndarray, " ch"] | None = None  # mean field change while the press was held
-        # times of the first and last reading without contact before the press
-        self._rest: tuple[float, float] | None = None
-        self._press: list[tuple[float, Float64[np.ndarray, " ch"]]] = []
-
-    @property
-    def complete(self) -> bool:
-        return self.held_s is not None
-
-    def add(self, estimates: Estimates) -> None:
-        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a press."""
-        known = np.isfinite(estimates.db_uT).all(axis=1)
-        readings = zip(estimates.t_s[known].tolist(), estimates.db_uT[known], estimates.contact[known], strict=True)
-        for t_s, db_uT, contact in readings:
-            if self.complete:
-                return
-            if contact:
-                if len(self._press) < PRESS_READINGS_MAX_N:
-                    self._press.append((t_s, db_uT.astype(np.float64)))
-            elif self._press:
-                self._end_press()
-                self._rest, self._press = (t_s, t_s), []
-            else:
-                self._rest = (self._rest[0] if self._rest else t_s, t_s)
-
-    def _end_press(self) -> None:
-        t_s = np.array([time_s for time_s, _ in self._press])
-        db_uT = np.array([change_uT for _, change_uT in self._press])
-        size_uT = np.linalg.norm(db_uT, axis=1)
-        held = np.flatnonzero(size_uT >= PLATEAU * size_uT.max())
-        first_s, last_s = float(t_s[held[0]]), float(t_s[held[-1]])
-        if self._rest is None:
-            self.problem = "the press had begun before the label was entered; lift, then press again"
-            return
-        rest_end_s = self._rest[1] - APPROACH_S
-        rest_start_s = max(self._rest[0] + RECOVERY_S, rest_end_s - REST_MAX_S)
-        if rest_end_s - rest_start_s < REST_MIN_S:
-            self.problem = "the skin was touched shortly before the press; lift for a second, then press again"
-        elif last_s - first_s < DWELL_MIN_s:
-            self.problem = "the press was too short; press again, and hold the press for half a second"
-        else:
-            self.rest_s, self.held_s = (rest_start_s, rest_end_s), (first_s, last_s)
-            self.db_uT = db_uT[held[0] : held[-1] + 1].mean(axis=0)
 
 
 class PageRecording:
@@ -200,7 +219,7 @@ class PageRecording:
 
         Raises CaptureError if the time without contact before the press is not in the recording.
         """
-        if press.rest_s is None or press.held_s is None or press.rest_s[0] < self._begun_s:
+        if press.rest_s[0] < self._begun_s:
             raise CaptureError(
                 "not recorded: the recording has no reading without contact before this press. Press again."
             )

@@ -19,7 +19,7 @@ from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
 from reskin.live.models import Models, SkinFolder, UniversalEstimator
-from reskin.live.presses import GuidedPresses, LabelledPress, PageRecording, Presses
+from reskin.live.presses import GuidedPresses, LabelledPress, NextPress, PageRecording, Press, Presses
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, check_ports
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.labels import Label
@@ -181,10 +181,8 @@ class Session:
         self._model_name, self._alone, self._emulated, self._skins = model_name, alone, emulated, skins or SkinFolder()
         self.traces: Traces | None = None
         self._error = ""
-        self._presses: Presses | None = None
-        self._labelled_press: LabelledPress | None = None
+        self._task: Presses | NextPress | None = None  # the presses that the user is asked for
         self._doubtful_press: LabelledPress | None = None  # contradicts the model; the user may keep or discard it
-        self._guided_press: LabelledPress | None = None  # the guided press in progress, whose label will be recorded
         self._adapted = self._labelled = ""  # texts for the user about the last calibration and the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
@@ -218,8 +216,12 @@ class Session:
                 self._change_model()
                 if estimates is not None:
                     now_s = self.skin.reader.unix_s()
-                    self._adapt(estimates)
-                    self._label(estimates)
+                    task = self._task
+                    if isinstance(task, Presses):
+                        self._collect(task, estimates)
+                    elif task is not None:
+                        for press in task.add(estimates):
+                            self._label(task, press)
                     with self._lock:
                         self.traces = self.traces or Traces(self.skin.layout, now_s - 1.0)
                         self.traces.add(estimates, now_s)
@@ -245,79 +247,67 @@ class Session:
             except (ReskinError, OSError) as error:
                 self._adapted = str(error)
 
-    def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if the user has requested this with a button.
-
-        When there are enough presses, the universal model is calibrated. Bytes that arrive during the calibration are
-        not lost, because they stay in the reader's buffer.
-        """
-        presses, estimator = self._presses, self.skin.estimator
-        if presses is not None and isinstance(estimator, UniversalEstimator):
-            self._collect(presses, estimates)
-            if presses.complete:
-                try:
-                    if isinstance(presses, GuidedPresses):
-                        self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
-                    else:
-                        self._adapted = estimator.adapt(presses.db_uT)
-                except SchemaError as error:  # raised if no press changed the field
-                    self._adapted = str(error)
-                with self._button_lock:  # the user may have started another collection during the calibration
-                    if self._presses is presses:
-                        self._presses = None
-
     def _collect(self, presses: Presses, estimates: Estimates) -> None:
         """Add readings to the presses that are being collected.
 
-        If there is a recording, the labels of guided presses are also written to the recording.
+        If there is a recording, the labels of guided presses are also written to the recording. When there are enough
+        presses, the universal model is calibrated. Bytes that arrive during the calibration are not lost, because they
+        stay in the reader's buffer.
         """
-        before_n, next_mm = len(presses), presses.next_mm
-        if next_mm is not None and self._guided_press is None:
-            self._guided_press = LabelledPress(Label(True, x_mm=next_mm[0], y_mm=next_mm[1]), learn=False)
-        if next_mm is not None and self._guided_press is not None:
-            self._guided_press.add(estimates)
-        presses.add(estimates)
-        if len(presses) == before_n:
+        estimator, before_n = self.skin.estimator, len(presses)
+        if not isinstance(estimator, UniversalEstimator):
             return
-        done, self._guided_press = self._guided_press, None  # the next press has another label, as its place is another
+        for i, press in enumerate(presses.add(estimates), start=before_n):
+            if isinstance(presses, GuidedPresses):
+                self._record_guided(presses, i, press)
+        if presses.complete:
+            try:
+                if isinstance(presses, GuidedPresses):
+                    self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
+                else:
+                    self._adapted = estimator.adapt(presses.db_uT)
+            except SchemaError as error:  # raised if no press changed the field
+                self._adapted = str(error)
+            with self._button_lock:  # the user may have started another collection during the calibration
+                if self._task is presses:
+                    self._task = None
+
+    def _record_guided(self, presses: GuidedPresses, i: int, press: Press) -> None:
+        """Write the label of the i-th guided press to the recording, if there is one."""
         with self._button_lock:
-            if done is not None and self._recording is not None:
+            if self._recording is not None:
+                x_mm, y_mm = presses.place_mm[i].tolist()
                 try:
-                    if not done.complete:
-                        raise CaptureError(done.problem or "the time between two presses was too short")
-                    self._recording.add(done)
+                    self._recording.add(press.label(Label(True, x_mm=x_mm, y_mm=y_mm)))
                     self._labelled = ""
                 except (ReskinError, OSError) as error:
-                    self._labelled = (
-                        f"press {before_n + 1} of {presses.presses_n} has no label in the recording: {error}"
-                    )
+                    self._labelled = f"press {i + 1} of {presses.presses_n} has no label in the recording: {error}"
 
-    def _label(self, estimates: Estimates) -> None:
-        """Wait for the press for which the user has entered a label.
+    def _label(self, task: NextPress, press: Press) -> None:
+        """Use a press for the label that the user has entered, or state why the press cannot be used.
 
-        After this press, its label is written to the recording, if there is one, and the model is calibrated to the
-        press, if the user has requested this.
+        The label is written to the recording, if there is one, and the model is calibrated to the press, if the user
+        has requested this.
         """
-        press = self._labelled_press
-        if press is None:
-            return
-        press.add(estimates)
-        if not press.complete or press.db_uT is None:
+        try:
+            labelled = press.label(task.label)
+        except CaptureError as error:
+            task.problem = str(error)
             return
         estimator, doubt = self.skin.estimator, ""
-        if press.learn and isinstance(estimator, UniversalEstimator):
-            doubt = estimator.contradiction((press.label.x_mm, press.label.y_mm), press.db_uT)
+        if task.learn and isinstance(estimator, UniversalEstimator):
+            doubt = estimator.contradiction((task.label.x_mm, task.label.y_mm), labelled.db_uT)
         with self._button_lock:
-            if self._labelled_press is not press:  # the user has cancelled the label
+            if self._task is not task:  # the user has cancelled the label, or an earlier press was used for it
                 return
-            self._labelled_press, self._doubtful_press = None, press if doubt else None
+            self._task, self._doubtful_press = None, labelled if doubt else None
             if doubt:
-                self._labelled = f"press {_place(press.label)}: {doubt}"
+                self._labelled = f"press {_place(task.label)}: {doubt}"
                 return
-        self._use_label(press)
+        self._use_label(labelled, learn=task.learn)
 
-    def _use_label(self, press: LabelledPress) -> None:
-        """Write a label to the recording, and calibrate the model to the press."""
+    def _use_label(self, press: LabelledPress, *, learn: bool) -> None:
+        """Write a label to the recording, if there is one; calibrate the model to the press if `learn` is set."""
         done, estimator = [], self.skin.estimator
         with self._button_lock:
             try:
@@ -326,7 +316,7 @@ class Session:
                     done.append(f"recorded as labelled press {self._recording.touches_n}")
             except (ReskinError, OSError) as error:
                 done.append(str(error))
-        if press.learn and press.db_uT is not None and isinstance(estimator, UniversalEstimator):
+        if learn and isinstance(estimator, UniversalEstimator):
             try:
                 done.append(estimator.add_label((press.label.x_mm, press.label.y_mm), press.label.Fz_N, press.db_uT))
             except ReskinError as error:
@@ -336,7 +326,7 @@ class Session:
     def _use_doubtful_label(self, _: UniversalEstimator) -> str:
         press, self._doubtful_press = self._doubtful_press, None
         if press is not None:
-            self._use_label(press)
+            self._use_label(press, learn=True)
         return self._adapted
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
@@ -362,8 +352,9 @@ class Session:
 
         The message contains the texts on the page, the alarms, and the layout of the board.
         """
-        skin, detected, presses = self.skin, self.skin.detected, self._presses
-        recording, press, traces = self._recording, self._labelled_press, self.traces
+        skin, detected, recording, traces = self.skin, self.skin.detected, self._recording, self.traces
+        task = self._task
+        presses, labelling = task if isinstance(task, Presses) else None, task if isinstance(task, NextPress) else None
         alarms = [self._error, *skin.alarms()]
         if self._doubtful_press is not None:
             alarms.append(self._labelled)
@@ -379,8 +370,8 @@ class Session:
             "alarms": [alarm for alarm in alarms if alarm not in ("", WAITING)],
             "recording": str(recording.folder) if recording else "",
             "recorded": self._recorded,
-            "labelling": "" if press is None else _waiting_for(press),
-            "label_mm": None if press is None else [press.label.x_mm, press.label.y_mm],
+            "labelling": "" if labelling is None else _waiting_for(labelling),
+            "label_mm": None if labelling is None else [labelling.label.x_mm, labelling.label.y_mm],
             "labelled": self._labelled, "doubtful": self._doubtful_press is not None,
             "skins": self._skins.names(), "skins_folder": str(self._skins.folder),
             "true_places": self._emulated is not None and self._emulated.has_true_contacts,
@@ -451,8 +442,8 @@ class Session:
                 self._doubtful_press = None
             elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
                 requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
-                self._presses = requested if self._presses is None else None
-                self._labelled_press = self._doubtful_press = self._guided_press = None
+                self._task = None if isinstance(self._task, Presses) else requested
+                self._doubtful_press = None
             elif button == "record" and self._recording is not None:
                 self._end_recording()
             elif button == "record" and self.skin.detected.problem is None:
@@ -477,7 +468,11 @@ class Session:
         A label is a dict with the keys `x_mm` and `y_mm` (the place), `force_N` (the force, or None if it is unknown)
         and `learn` (whether the model is calibrated to the press). Raises ParamsError if it cannot be used.
         """
-        self._labelled_press, self._doubtful_press, self._labelled = None, None, ""
+        if isinstance(self._task, Presses):
+            raise ParamsError(
+                "label: presses for button Adapt or Places are being collected. Finish or cancel this first."
+            )
+        self._task, self._doubtful_press, self._labelled = None, None, ""
         if label is None:
             return
         if not isinstance(label, dict):
@@ -496,11 +491,7 @@ class Session:
                 "label: the label would be neither recorded nor used for calibration. Start a recording (key r), or "
                 "tick the box to calibrate the model to the press."
             )
-        if self._presses is not None:
-            raise ParamsError(
-                "label: presses for button Adapt or Places are being collected. Finish or cancel this first."
-            )
-        self._labelled_press = LabelledPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)
+        self._task = NextPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)
 
     def _begin_recording(self) -> None:
         """Start to write the byte stream to a new capture."""
@@ -522,8 +513,8 @@ class Session:
                 self._recorded = f"cannot close {recording.folder}.part: {error.strerror}"
 
 
-def _waiting_for(press: LabelledPress) -> str:
-    return f"press {_place(press.label)}. {press.problem[:1].upper()}{press.problem[1:]}".strip()
+def _waiting_for(task: NextPress) -> str:
+    return f"press {_place(task.label)}. {task.problem[:1].upper()}{task.problem[1:]}".strip()
 
 
 def _place(label: Label) -> str:

@@ -15,7 +15,7 @@ from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live import models
 from reskin.live.emulator import encode_pieces
 from reskin.live.models import MEASURED_FILE, NetworkEstimator, SkinFolder, UniversalEstimator
-from reskin.live.presses import PRESSES_N, GuidedPresses, LabelledPress, PageRecording
+from reskin.live.presses import PRESSES_N, GuidedPresses, LabelledPress, PageRecording, PressFinder
 from reskin.live.server import receive
 from reskin.live.session import Session
 from reskin.live.tracker import Estimates
@@ -352,12 +352,10 @@ def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, m
 
 def test_label_of_a_press_is_refused_if_no_no_load_readings_were_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    press, reader = LabelledPress(Label(True, 1.0, 2.0), learn=False), PausingReader(make_script(pokes_n=0))
+    reader = PausingReader(make_script(pokes_n=0))
     recording = PageRecording(find.DetectedBoard("/dev/board", None, "binary", 5), reader, port_in_name=True)
-    press.rest_s, press.held_s = (
-        (reader.unix_s() - 1.0, reader.unix_s()),
-        (reader.unix_s() + 1.0, reader.unix_s() + 2.0),
-    )
+    now_s = reader.unix_s()
+    press = LabelledPress(Label(True, 1.0, 2.0), (now_s - 1.0, now_s), (now_s + 1.0, now_s + 2.0), np.zeros(15))
     with pytest.raises(CaptureError, match="recording has no reading without contact before this press. Press again"):
         recording.add(press)
     assert recording.end() == f"recorded {recording.folder}"
@@ -365,14 +363,13 @@ def test_label_of_a_press_is_refused_if_no_no_load_readings_were_recorded(tmp_pa
     assert not (recording.folder / PROBE_FILE).exists()
 
 
-def feed(press, contact, seconds, rate_hz=100.0):
-    """Add readings with or without contact to a press. In contact, every channel changes by 100 uT."""
-    start_s = feed.t_s
-    t_s = start_s + np.arange(round(seconds * rate_hz)) / rate_hz
-    feed.t_s = start_s + seconds
-    db_uT = np.full((len(t_s), 15), 100.0 * contact, np.float32)
-    none = np.zeros((len(t_s), 3))
-    press.add(Estimates(t_s, db_uT, db_uT, none, none[:, :2], none[:, 2], np.full(len(t_s), contact)))
+def presses_of(parts, rate_hz=100.0):
+    """Return the presses in a stream of times with or without contact. In contact, every channel changes by 100 uT."""
+    contact = np.concatenate([np.full(round(seconds * rate_hz), touched) for touched, seconds in parts])
+    db_uT = np.full((len(contact), 15), 100.0, np.float32) * contact[:, None]
+    none = np.zeros((len(contact), 3))
+    t_s = np.arange(len(contact)) / rate_hz
+    return PressFinder().add(Estimates(t_s, db_uT, db_uT, none, none[:, :2], none[:, 2], contact))
 
 
 @pytest.mark.parametrize(
@@ -381,14 +378,11 @@ def feed(press, contact, seconds, rate_hz=100.0):
      ([(False, 1.0), (True, 0.03)], "too short")],
 )  # fmt: skip
 def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
-    press, feed.t_s = LabelledPress(Label(True, 1.0, 2.0), learn=False), 0.0
-    for contact, seconds in [*parts, (False, 0.1)]:
-        feed(press, contact, seconds)
-    assert problem in press.problem
-    assert not press.complete
-    for contact, seconds in [(False, 1.0), (True, 0.5), (False, 0.1)]:
-        feed(press, contact, seconds)
-    assert press.complete
+    label = Label(True, 1.0, 2.0)
+    unusable, usable = presses_of([*parts, (False, 1.1), (True, 0.5), (False, 0.1)])
+    with pytest.raises(CaptureError, match=problem):
+        unusable.label(label)
+    press = usable.label(label)
     assert press.rest_s[1] < press.held_s[0] < press.held_s[1]
     np.testing.assert_allclose(press.db_uT, 100.0)
 
