@@ -117,13 +117,13 @@ def field_memory(
     return before_T, added_T
 
 
-def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
+def relaxed_share(relaxation: Relaxation) -> float:
     """Return the force of a skin when an indentation is read, divided by the force of an elastic skin at this time.
 
     The result is below 1, because the force of the skin relaxes during the approach and the hold of the tip.
     """
-    elastic = np.array([0.0, 1.0, 1.0])
-    return float(relax(np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), elastic, prony)[-1])
+    time_s, elastic = np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), np.array([0.0, 1.0, 1.0])
+    return float(relax(time_s, elastic, SKIN_RELAXATION)[-1])
 
 
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:

@@ -40,14 +40,6 @@ def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def ball_moment(radius_m: float, b_T: Float[np.ndarray, "3"], mu_r: float = IRON_MU_R) -> Float[np.ndarray, "3"]:
-    """Return the magnetic moment in A m^2 of an iron ball in the uniform field `b_T`.
-
-    For a ball of radius a in the field B, the moment is (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B.
-    """
-    return 4 * np.pi * radius_m**3 / mu_0 * (mu_r - 1) / (mu_r + 2) * b_T
-
-
 def ball_field(
     observers_m: Float[np.ndarray, "o 3"],
     b_T: Float[np.ndarray, "3"],
@@ -58,9 +50,11 @@ def ball_field(
 ) -> Float[np.ndarray, "o 3"]:
     """Return the field in T that an iron ball adds to the uniform field `b_T`.
 
-    The observers must be outside the ball.
+    It is the field of a dipole at the centre of the ball. For a ball of radius a in the field B, the moment of the
+    dipole is (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B. The observers must be outside the ball.
     """
-    return magnet.field(centre_m[None], ball_moment(radius_m, b_T, mu_r)[None], observers_m)
+    moment_A_m2 = 4 * np.pi * radius_m**3 / mu_0 * (mu_r - 1) / (mu_r + 2) * b_T
+    return magnet.field(centre_m[None], moment_A_m2[None], observers_m)
 
 
 def ball_images(

@@ -93,15 +93,6 @@ def depth_scale(size: float) -> float:
     return size / (1 + size**4) ** 0.25
 
 
-def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
-    """Return the depths at which steps end.
-
-    These are the requested depths, and all depths of the ladder that are below the largest requested depth.
-    """
-    ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
-    return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
-
-
 def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
     """Return points of the undeformed material, so that the deformation gradient F is the identity matrix."""
     return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))

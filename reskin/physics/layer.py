@@ -16,7 +16,7 @@ from math import exp, expm1
 from typing import Literal, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numba import njit
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
@@ -169,14 +169,6 @@ class IndentedLayer:
         return contact_of_depth(depth_m, thickness_m=self.thickness_m, tip_radius_m=self.tip_radius_m, base=self.base)
 
 
-def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
-    """Return for each depth whether it is beyond the range in which the published solution was verified.
-
-    The range ends at `VERIFIED_DEPTH` times the thickness.
-    """
-    return depth_m >= VERIFIED_DEPTH * thickness_m
-
-
 def force(
     depth_m: Float[np.ndarray, " n"],
     *,
@@ -239,28 +231,15 @@ def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pre
 
     The points are at the distance r from the axis and at the height z. The components of the displacement are
     u_r = sum of amplitude g'(kz) J1(kr) and u_z = -sum of amplitude g(kz) J0(kr). Both sums are over all waves of the
-    pressure. The function g is computed by `depth_profile`.
+    pressure. The function g (`_bonded_wave` or `_slipping_wave`) is the depth profile of a wave: a wave with amplitude
+    p^ displaces material at the height z downwards by p^ g(kz) / (2G k), where G is the shear modulus. At the surface,
+    g(kh) is the compliance of the layer relative to a half-space (see `bonded_compliance`).
     """
     top = float(np.max(r_m, initial=0.0) * pressure.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
     rows = np.stack([pressure.k_per_m, pressure.thickness_m * pressure.k_per_m, pressure.amplitude_m])
     out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, rows, pressure.base == "slipping", table)
     return Displacement(r_m=out_m, z_m=up_m, r_r=squeeze - hoop, r_z=r_z, z_r=z_r, z_z=-squeeze, hoop=hoop)
-
-
-def depth_profile(
-    kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
-) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Return the depth profile g(kz) of each wave, and the first two derivatives of g with respect to kz.
-
-    The depth profile states how much a pressure wave displaces the material at each height: a wave of amplitude p^
-    displaces material at the height z downwards by p^ g(kz) / (2G k), where G is the shear modulus. At the surface,
-    g(kh) is the compliance of the layer relative to a half-space (see `bonded_compliance`).
-    """
-    factors_of, wave = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
-    profiles = [[wave(z, h, factors_of(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
-    g, slope, bend = np.array(profiles).transpose(2, 0, 1)
-    return g, slope, bend
 
 
 @lru_cache(maxsize=64)

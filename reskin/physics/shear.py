@@ -98,8 +98,6 @@ def _check_drag(
         )
 
 
-# Distance in thicknesses by which tables extend beyond the contact. Material that is farther away does not move.
-REACH = 5.0
 WIDEST = 3.0  # largest contact radius in thicknesses; for larger contacts, `layer.WAVES_KH` would be too coarse
 # Largest height of the bulging rim around the tip in thicknesses, as in `deformation`. Nodes in the rim are above the
 # table, and are displaced like the surface.
@@ -253,17 +251,12 @@ def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: l
     )
 
 
-def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = None) -> ShearMap:
-    """Tabulate the shear of the layer due to a traction for distances from the axis up to `reach_m`.
-
-    By default, the table extends to `REACH` thicknesses beyond the contact.
-    """
+def tabulate(traction: Traction, thickness_m: float, reach_m: float) -> ShearMap:
+    """Tabulate the shear of the layer due to a traction for distances from the axis up to `reach_m`."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule = f"above 0 m and at most {WIDEST} times the skin's thickness"
         got = f"{traction.radius_m} m on a skin with a thickness of {thickness_m} m"
         raise ParamsError("drag", "contact radius", rule, got, "Reduce the depth of the drag.")
-    if reach_m is None:
-        reach_m = traction.radius_m + REACH * thickness_m
     r_m = np.linspace(0, reach_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
     parts = evaluate_map(traction, r_m, z_m, thickness_m=thickness_m)

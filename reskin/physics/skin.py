@@ -206,7 +206,7 @@ def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
 
     See `layer.VERIFIED_DEPTH`.
     """
-    return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
+    return int((depth_m + skin.depth_zero_m >= layer.VERIFIED_DEPTH * skin.thickness_m).sum())
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

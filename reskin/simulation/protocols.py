@@ -24,15 +24,6 @@ DEPTH_STEP_M = 1e-12
 DEEPEST_SHARE = 0.999  # largest depth under a load, as a fraction of the thickness or the tip radius (the smaller one)
 
 
-@dataclass(frozen=True)
-class Stops:
-    """The positions of the tip in mm, for n indentations with p stops each."""
-
-    x_mm: Float64[np.ndarray, "n p"]
-    y_mm: Float64[np.ndarray, "n p"]
-    depth_mm: Float64[np.ndarray, "n p"]
-
-
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Depth_mm = Annotated[float, Field(gt=0, le=10)]
 Depths_mm = Annotated[tuple[Depth_mm, ...], Field(min_length=1)]
@@ -110,9 +101,8 @@ class Grid(ProtocolSettings):
         In each pass, all places are pressed at the first depth, then all places at the second depth, and so on.
         """
         pokes = protocol(self.depths_mm, self.passes_n)
-        stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
         return _upright_plan(
-            stops,
+            (pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None]),
             f"presses at the 65 places of the grid, at {len(self.depths_mm)} depths, in {self.passes_n} passes",
             pokes.pass_i,
         )
@@ -145,7 +135,7 @@ class Drag(ProtocolSettings):
         # the tangential force from the place.
         directions = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
-        stops = Stops(
+        stops_mm = (
             np.concatenate([x_mm[:, direction] for direction in directions]),
             np.concatenate([y_mm[:, direction] for direction in directions]),
             np.repeat(depth_mm[:, None], stops_n, axis=1),
@@ -153,7 +143,7 @@ class Drag(ProtocolSettings):
         description = f"tip dragged along lines every {PITCH_MM:g} mm, at {depths_n} depths, in {self.passes_n} passes"
         description += f", with stops every {2 * CENTRE_MM / (stops_n - 1):g} mm"
         pass_i = np.repeat(np.arange(self.passes_n, dtype=np.int32), depths_n * lines_n)
-        return _upright_plan(stops, description, pass_i)
+        return _upright_plan(stops_mm, description, pass_i)
 
 
 class Hand(_RandomDepth):
@@ -208,8 +198,8 @@ class Scatter(_RandomDepth):
         depth_mm = rng.uniform(*self.depth_mm, size=(self.pokes_n, 1))
         description = f"{self.pokes_n} presses at random places on a skin of {skin_mm[0]:g} x {skin_mm[1]:g} mm, "
         description += f"at least {self.margin_mm:g} mm from its edges"
-        stops = Stops(place_mm[:, :1], place_mm[:, 1:], depth_mm)
-        return _upright_plan(stops, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
+        stops_mm = (place_mm[:, :1], place_mm[:, 1:], depth_mm)
+        return _upright_plan(stops_mm, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
 
 
 class Load(_OnlyTemperature):
@@ -239,10 +229,10 @@ class Load(_OnlyTemperature):
         """
         weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
         centre_mm = np.full(weight_N.shape, CENTRE_MM)
-        stops = Stops(centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
+        stops_mm = (centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
         description = f"a glass on the skin, filled {self.passes_n} times to {self.force_max_N:g} N "
         description += f"in steps of {self.step_N:g} N"
-        return _upright_plan(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
+        return _upright_plan(stops_mm, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
 
 
 class Press(_OnlyTemperature):
@@ -272,9 +262,9 @@ class Press(_OnlyTemperature):
         for i, peak_mm in enumerate(rng.uniform(*self.depth_mm, size=self.presses_n)):
             depths_mm[i, : long_n[i]] = half_sine(int(long_n[i]), float(peak_mm))
         flat = np.ones(depths_mm.shape)
-        stops = Stops(place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
+        stops_mm = (place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
         return _upright_plan(
-            stops, f"{self.presses_n} presses that last {least_s:g} to {most_s:g} s, with readings at all times"
+            stops_mm, f"{self.presses_n} presses that last {least_s:g} to {most_s:g} s, with readings at all times"
         )
 
 
@@ -305,28 +295,28 @@ class Walk(_OnlyTemperature):
             for stance, swing, peak_mm in zip(stance_n, swing_n, peaks_mm, strict=True)
             for part in (half_sine(int(stance), float(peak_mm)), np.full(int(swing), LIFTED_MM))
         ]
-        stops = Stops(place_mm[None, :, 0], place_mm[None, :, 1], np.concatenate(parts)[None])
-        return _upright_plan(stops, f"{self.steps_n} steps of a walk in one continuous recording")
+        stops_mm = (place_mm[None, :, 0], place_mm[None, :, 1], np.concatenate(parts)[None])
+        return _upright_plan(stops_mm, f"{self.steps_n} steps of a walk in one continuous recording")
 
 
 Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
 
 
 def _upright_plan(
-    stops: Stops,
+    stops_mm: tuple[np.ndarray, np.ndarray, np.ndarray],
     description: str,
     pass_i: Int32[np.ndarray, " n"] | None = None,
     *,
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Create a plan with an upright tip. If `pass_i` is None, all indentations belong to one pass."""
-    n = len(stops.depth_mm)
+    """Create a plan with an upright tip, from x, y and depth at the p stops of n indentations.
+
+    If `pass_i` is None, all indentations belong to one pass.
+    """
+    n = len(stops_mm[0])
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
-    return Plan(
-        passes, stops.x_mm, stops.y_mm, stops.depth_mm, np.zeros((n, 2)), description, weight_N=weight_N,
-        centre_mm=centre_mm,
-    )  # fmt: skip
+    return Plan(passes, *stops_mm, np.zeros((n, 2)), description, weight_N=weight_N, centre_mm=centre_mm)
 
 
 def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:

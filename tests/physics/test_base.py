@@ -100,7 +100,7 @@ def test_shear_of_a_dragged_layer_equals_finite_elements(radius_h, tolerance):
 
     elements = Layer(H_M, radius_m + H_M, radius_m + 8 * H_M, 6, along_x_strains)
     solved = elements.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
-    motion, table = solved.inside, shear.tabulate(traction, H_M)
+    motion, table = solved.inside, shear.tabulate(traction, H_M, traction.radius_m + 5 * H_M)
     (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (motion.r_m, motion.z_m))
     truth = np.moveaxis(shear.evaluate_map(traction, r_m, z_m, thickness_m=H_M), 2, 0)[:, r_i, z_i]
     near = motion.r_m < radius_m + 3 * H_M

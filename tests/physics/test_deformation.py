@@ -21,9 +21,15 @@ def nodes(r_n=25, z_n=11, r_max_m=5e-3):
     return r_m.ravel(), z_m.ravel()
 
 
+def depth_steps(to_m, press):
+    """Return the depths of the ladder below `to_m`, and `to_m`."""
+    ladder_m = press.thickness_m * deformation.depth_scale(press.tip_radius_m / press.thickness_m) * deformation.LADDER
+    return np.append(ladder_m[ladder_m < to_m], to_m)
+
+
 def follow(r_m, z_m, to_m=1.2e-3, base="bonded"):
     press = layer.IndentedLayer(H_M, TIP_M, base)
-    return deformation.follow(r_m, z_m, deformation.depth_steps((to_m,), press), press=press)[-1]
+    return deformation.follow(r_m, z_m, depth_steps(to_m, press), press=press)[-1]
 
 
 def det_f(deformed):

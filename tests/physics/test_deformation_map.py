@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer
+from tests.physics.test_deformation import follow
 
 H_M, TIP_M = 2e-3, 3e-3
 HEIGHTS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
@@ -22,11 +23,6 @@ depths_m = st.floats(1e-5, 1.2e-3)
 @cache  # The table is not computed at import, because every test worker imports this module.
 def table(base="bonded"):
     return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
-
-
-def follow(r_m, z_m, to_m, base):
-    press = layer.IndentedLayer(H_M, TIP_M, base)
-    return deformation.follow(r_m, z_m, deformation.depth_steps((to_m,), press), press=press)[-1]
 
 
 def move(places_m, poke_m, base="bonded"):

@@ -145,7 +145,7 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
     truth = np.stack(
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
-    table = shear.tabulate(traction, H_M)
+    table = shear.tabulate(traction, H_M, traction.radius_m + 5 * H_M)
     found = displace([YOUNG_PA / 3, 0], places_m, table, centre_m=(0, 0)).half_curl
     # The tolerance is the error of central differences and of the table.
     np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)
@@ -154,7 +154,12 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
 def test_tabulated_displacement_equals_direct_integration(force):
     traction, places_m = sliding(), random_places_m(top=1.0)
-    found = displace(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
+    found = displace(
+        np.array(force) * YOUNG_PA / 3,
+        places_m,
+        shear.tabulate(traction, H_M, traction.radius_m + 5 * H_M),
+        centre_m=(0, 0),
+    )
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
     truth_m = displacement_m(traction, places_m @ turn) @ turn.T
     # The tolerance is the error of interpolation between places of the table, which are 25 um apart.
@@ -249,8 +254,8 @@ def test_midpoint_steps_equal_many_small_steps_of_force():
         ("depth", lambda: shear.tabulate_depth(np.nan, **SKIN)),
         ("depth", lambda: shear.tabulate_depth(2e-3, **SKIN)),
         ("thickness", lambda: shear.tabulate_depth(1e-3, thickness_m=0.0, tip_radius_m=3e-3, base="bonded")),
-        ("contact radius", lambda: shear.tabulate(hertzian(6.1e-3), H_M)),
-        ("contact radius", lambda: shear.tabulate(hertzian(), np.inf)),
+        ("contact radius", lambda: shear.tabulate(hertzian(6.1e-3), H_M, 10e-3)),
+        ("contact radius", lambda: shear.tabulate(hertzian(), np.inf, 10e-3)),
         ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=0.0)),
         ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=np.nan)),
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),

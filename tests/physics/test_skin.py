@@ -20,6 +20,7 @@ from reskin.physics.skin import SkinDesign, changes_of_field, count_beyond_verif
 from tests.laws import LIMITS
 from tests.physics.test_board import design as board_design
 from tests.physics.test_board import draw_board, no_spread, spreads
+from tests.physics.test_deformation import depth_steps
 
 EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
@@ -157,9 +158,7 @@ def test_field_change_from_tables_equals_that_of_nodes_moved_in_steps(thickness_
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
         poke_m = np.array([1.3e-3, -2.1e-3, (1 - at) * ladder_m[rung_i] + at * ladder_m[rung_i + 1]])
-        depths_m = deformation.depth_steps(
-            (float(poke_m[2]),), layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base)
-        )
+        depths_m = depth_steps(poke_m[2], layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base))
         truth = laws.follow_dipoles(one, poke_m[:2], depths_m)
         # On a bonded base, nothing moves beyond the range of the table.
         near = np.linalg.norm(
