@@ -235,39 +235,6 @@ class Load(_OnlyTemperature):
         return _upright_plan(stops_mm, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
 
 
-class Press(_OnlyTemperature):
-    """Presses at places of the grid, with readings during the whole press (dynamic data, section 7 of the paper).
-
-    The depth of a press over time is half a period of a sine. Each frame is one stop.
-    """
-
-    kind: Literal["press"]
-    presses_n: Count
-    # limits of the duration of a press; the logarithm of the duration is uniformly distributed between these limits
-    duration_s: tuple[Duration_s, Duration_s]
-    depth_mm: tuple[Depth_mm, Depth_mm]  # limits of the largest depth of a press, which is uniformly distributed
-    rate_hz: Rate_hz
-
-    def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw the place, the duration and the largest depth of each press.
-
-        All presses have as many stops as the longest press. After a shorter press, the tip
-        stays above the skin for the remaining stops.
-        """
-        least_s, most_s = self.duration_s
-        long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
-        long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)
-        place_mm = _draw_places_mm(self.presses_n, rng)
-        depths_mm = np.full((self.presses_n, int(long_n.max())), LIFTED_MM)
-        for i, peak_mm in enumerate(rng.uniform(*self.depth_mm, size=self.presses_n)):
-            depths_mm[i, : long_n[i]] = half_sine(int(long_n[i]), float(peak_mm))
-        flat = np.ones(depths_mm.shape)
-        stops_mm = (place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
-        return _upright_plan(
-            stops_mm, f"{self.presses_n} presses that last {least_s:g} to {most_s:g} s, with readings at all times"
-        )
-
-
 class Walk(_OnlyTemperature):
     """Steps of a shoe, or touches of a glove, in one continuous recording (paper section 6: dog shoe, glove)."""
 
@@ -299,7 +266,7 @@ class Walk(_OnlyTemperature):
         return _upright_plan(stops_mm, f"{self.steps_n} steps of a walk in one continuous recording")
 
 
-Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
+Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Walk, Field(discriminator="kind")]
 
 
 def _upright_plan(

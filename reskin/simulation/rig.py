@@ -18,7 +18,7 @@ from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, read_field, read_temperature
 from reskin.recordings.probe import ProbeLog
 from reskin.simulation.contact import Response
-from reskin.simulation.protocols import Plan, Press, Protocol, Rate_hz, Walk
+from reskin.simulation.protocols import Plan, Protocol, Rate_hz, Walk
 
 FrameCount = Annotated[int, Field(ge=1, le=1000)]
 Spread = Annotated[float, Field(ge=0, le=1)]
@@ -72,15 +72,16 @@ class Timeline:
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
     """Return the settings of the rig with the changes that a protocol needs.
 
-    If the protocol sets a frame rate, it replaces the frame rate of the rig. The protocols `press` and `walk` have one
-    frame per stop. In the protocol `walk`, there is no robot, so the errors of the robot and the noise of the force are
-    set to zero, and the probe log has the same clock as the stream.
+    If the protocol sets a frame rate, it replaces the frame rate of the rig. The protocol `walk` has one frame per
+    stop and no robot, so the errors of the robot and the noise of the force are set to zero, and the probe log has the
+    same clock as the stream.
     """
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
-    if isinstance(protocol, Press | Walk):
-        changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
     if isinstance(protocol, Walk):
         changes |= {
+            "moving_frames_n": 0,
+            "settling_frames_n": 0,
+            "readings_n": 1,
             "noload_frames_n": max(round(protocol.quiet_s * protocol.rate_hz), 1),
             "robot_place_sd_mm": 0.0,
             "place_offset_sd_mm": 0.0,

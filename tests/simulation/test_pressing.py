@@ -1,4 +1,4 @@
-"""Tests of protocols with weights and dynamic presses: forces, half sines in time, footfalls, random presses."""
+"""Tests of protocols with weights and walks: forces, half sines in time, footfalls."""
 
 import numpy as np
 import pytest
@@ -13,16 +13,12 @@ from reskin.recordings.ingest import open_capture
 from reskin.recordings.readers.sd_card import read_log
 from reskin.seeds import rng_for
 from reskin.simulation.capture import simulate_capture, to_files
-from reskin.simulation.protocols import (
-    Press,
-    depths_under_load,
-)
+from reskin.simulation.protocols import Walk, depths_under_load
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.simulation.scene import synthesis, with_protocol
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": []}
 GLASS = {"kind": "load", "passes_n": 3, "force_max_N": 1.0, "step_N": 0.25} | SHARED
-PRESS = {"kind": "press", "presses_n": 4, "duration_s": (0.05, 0.2), "depth_mm": (0.4, 1.2), "rate_hz": 400.0} | SHARED
 WALK = {
     "kind": "walk", "steps_n": 3, "stance_s": (0.2, 0.5), "swing_s": (0.2, 0.6), "quiet_s": 0.4,
     "depth_mm": (0.4, 1.2), "rate_hz": 250.0,
@@ -52,27 +48,33 @@ def test_labels_of_a_filling_are_weights_and_no_depths():
 
 
 def test_frames_in_contact_form_dwells():
-    log = capture_of("press", PRESS).probe
-    plan = Press(**PRESS | {"terms": ()}).plan(rng_for(1, "recording", "press", "b0", "b0_s0", "plan"), SKIN_MM)
+    log = capture_of("log", WALK).probe
+    plan = Walk(**WALK | {"terms": ()}).plan(rng_for(1, "recording", "log", "b0", "b0_s0", "plan"), SKIN_MM)
     assert log.contact.sum() == (plan.depth_mm > 0).sum()
     dwell_s = (log.t_end_s - log.t_start_s)[log.contact]
-    np.testing.assert_allclose(dwell_s, 1 / 400, rtol=1e-3)
+    np.testing.assert_allclose(dwell_s, 1 / 250, rtol=1e-3)
     depths_mm = log.depth_mm[log.contact]
     np.testing.assert_allclose(depths_mm, plan.depth_mm[plan.depth_mm > 0], rtol=1e-6)
 
 
-def test_readings_of_a_rising_press_lag_behind_the_field():
+def one_step(rate_hz):
+    """Return a walk with one step: 4 frames at rest, and 20 frames in contact."""
+    times_s = {"stance_s": (20 / rate_hz,) * 2, "swing_s": (4 / rate_hz,) * 2, "quiet_s": 4 / rate_hz}
+    return WALK | {"steps_n": 1, "rate_hz": rate_hz, **times_s}
+
+
+def test_readings_of_a_rising_step_lag_behind_the_field():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     fast, slow = (
-        capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
-        # Both presses have 20 frames. They are 2.5 ms apart in the fast press, and 250 ms in the slow one.
-        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))
+        capture_of("log", one_step(rate_hz), chip=quiet)
+        # Both steps have 20 frames. They are 2.5 ms apart in the fast step, and 250 ms in the slow one.
+        for rate_hz in (400.0, 4.0)
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
-    late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
+    late_uT = np.abs(moving_uT - still_uT).max(axis=(0, 2))  # of each chip
     assert (late_uT > 1.0).all()  # A difference of 1 uT is more than three steps of z.
-    # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart. Each reading must therefore be between two
-    # readings of the slow press.
+    # The fast step is read up to 1.84 ms late, and frames are 2.5 ms apart. Each reading must therefore be between two
+    # readings of the slow step.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
     assert (moving_uT[1:] >= low_uT - 1).all()  # The tolerance of 1 uT is more than the resolution of the chips.
     assert (moving_uT[1:] <= high_uT + 1).all()
@@ -98,11 +100,11 @@ def test_times_of_true_forces_start_at_the_first_frame_of_the_log():
     assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2
 
 
-def test_presses_with_given_forces_cannot_be_simulated_with_relaxation_or_wear():
+def test_weights_and_walks_cannot_be_simulated_with_relaxation_or_wear():
     with pytest.raises(ParamsError, match="terms"):
-        with_protocol("press", PRESS | {"terms": ["relaxation"]})
-    with pytest.raises(ParamsError, match="duration_s must list the smaller value first"):
-        with_protocol("press", PRESS | {"duration_s": (1.0, 0.05)})
+        with_protocol("log", WALK | {"terms": ["relaxation"]})
+    with pytest.raises(ParamsError, match="stance_s must list the smaller value first"):
+        with_protocol("log", WALK | {"stance_s": (1.0, 0.05)})
     with pytest.raises(ParamsError, match="multiple of step_N"):
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
