@@ -163,28 +163,28 @@ def _find_models(missing: Path) -> str:
     return f"Scene {scene} trains it: in the checkout, run `reskin scenes use {scene}` and then `make repro`."
 
 
-def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read those networks of stage `train_multi` that were trained without this board. There is one for each seed."""
+def networks_held_out(models: Path, board: str) -> list[Network]:
+    """Read the networks of the headline recipe that were trained without this board. There is one for each seed."""
     networks = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
-        if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
+        if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, HEADLINE):
             networks.append(_read(file.with_suffix(SUFFIX), card))
     if not networks:
-        what = f"there are no networks of recipe {recipe} that were trained without board {board}"
+        what = f"there are no networks of recipe {HEADLINE} that were trained without board {board}"
         raise SchemaError(f"{models}: {what}. To train them, add lobo to the experiments of the scene.")
     return networks
 
 
-def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment by the name of the fold, one network for each fold and seed.
+def networks_by_fold(models: Path, experiment: str) -> dict[str, list[Network]]:
+    """Read the networks of the headline recipe by the name of the fold, one network for each fold and seed.
 
     The result is empty if the scene does not run the experiment.
     """
     by_fold: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
-        if (card["question"], card["recipe_name"]) == (experiment, recipe):
+        if (card["question"], card["recipe_name"]) == (experiment, HEADLINE):
             by_fold.setdefault(card["fold"], []).append(_read(file.with_suffix(SUFFIX), card))
     return by_fold
 

@@ -44,10 +44,7 @@ class Area(Strict):
         return np.array([self.half_x_mm, self.half_y_mm])
 
 
-PAPER_AREA = Area(half_x_mm=HALF_MM, half_y_mm=HALF_MM, octagon=True)
-
-
-def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[np.ndarray, " n"]:
+def inside(place_mm: Float[np.ndarray, "n 2"], area: Area) -> Bool[np.ndarray, " n"]:
     """Return whether each place is within an area or in the margin around it.
 
     Places are relative to the board's centre.

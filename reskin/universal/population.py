@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from reskin.physics.deformation import RestingDipoles
 from reskin.universal.law import (
     HALF_MM,
-    PAPER_AREA,
     Area,
     Law,
     Setup,
@@ -176,7 +175,7 @@ def draw_skin(
     return db_uT.reshape(*db_uT.shape[:2], -1), rest_uT.ravel(), place_mm, force_N
 
 
-def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.ndarray, "m 2"]:
+def draw_places(rng: np.random.Generator, area: Area) -> Float[np.ndarray, "m 2"]:
     """Draw the places of the presses on one skin, in mm from the board's centre.
 
     The result begins with all places of the grid. It continues with about half of these places again and with places
@@ -193,7 +192,7 @@ def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.n
     return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm, area)][:anywhere_n]])
 
 
-def grid(area: Area = PAPER_AREA) -> Float[np.ndarray, "65 2"]:
+def grid(area: Area) -> Float[np.ndarray, "65 2"]:
     """Return the places of the paper's grid, scaled to the size of an area, in mm from the centre of the area.
 
     The grid has 9 x 9 places without the four places in each corner.

@@ -39,6 +39,7 @@ from pipeline.training.methods import (
 )
 from reskin.errors import SchemaError
 from reskin.metrics import score
+from reskin.universal.layout import paper_layout
 from reskin.universal.model import FILE
 from reskin.universal.population import grid
 
@@ -50,7 +51,7 @@ FEW = settings(max_examples=20, deadline=None)
 @cache
 def make_board(seed: int = 1) -> Board:
     """Return a board whose skin was pressed twice at each place of the grid, with two readings per press."""
-    place_mm = np.repeat(grid() + MIDDLE_MM, 2, axis=0)
+    place_mm = np.repeat(grid(paper_layout().area) + MIDDLE_MM, 2, axis=0)
     depth_mm = np.tile([0.6, 1.0], len(place_mm) // 2)
     before_uT, pressed_uT, force_N = reskin.simulate_pokes(
         reskin.draw_skin(seed=seed), np.column_stack([place_mm, depth_mm]), board=reskin.draw_board(seed=seed)

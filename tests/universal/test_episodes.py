@@ -6,11 +6,12 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal import episodes
 from reskin.universal.episodes import RecordedBoard, Shape, disturb, disturb_labels, draw_episodes, order_presses
+from reskin.universal.layout import paper_layout
 from reskin.universal.network import LOG_N, PLACE_MM
 from reskin.universal.population import PRESSES_N, Population, draw_places
 
 RNG = rng_for(0, "episodes")
-PLACE_MM_OF = np.stack([draw_places(rng_for(i, "places")) for i in range(3)])
+PLACE_MM_OF = np.stack([draw_places(rng_for(i, "places"), paper_layout().area) for i in range(3)])
 
 
 def made_of(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:

@@ -20,7 +20,8 @@ def test_layout_of_the_papers_board_equals_the_constants_of_the_shipped_model():
     setup = layout.setup()
     filler_T, skin = setup.design.saturation_T, SkinDesign.model_validate(nominal("skin") | {"hold": setup.design.hold})
     assert skin == setup.design.model_copy(update={"saturation_T": filler_T * layout.skin.magnetisation})
-    assert (setup.rule, setup.coarse_rule, setup.area) == (law.RULE, law.COARSE, law.PAPER_AREA)
+    paper_area = law.Area(half_x_mm=law.HALF_MM, half_y_mm=law.HALF_MM, octagon=True)
+    assert (setup.rule, setup.coarse_rule, setup.area) == (law.RULE, law.COARSE, paper_area)
     assert (layout.law, layout.all_spreads, layout.forces) == (NOMINAL, NOMINAL_SPREADS, Forces(light_share=0.2))
     np.testing.assert_array_equal(layout.reach_mm, [[-10, -10], [10, 10]])
 
@@ -38,7 +39,7 @@ def test_layouts_of_the_project_can_be_simulated(name):
 
 def test_grid_is_scaled_to_the_area_and_octagons_exclude_its_corners():
     wide = law.Area(half_x_mm=12.0, half_y_mm=6.0, octagon=True)
-    np.testing.assert_array_equal(grid(wide), grid() * [1.5, 0.75])
+    np.testing.assert_array_equal(grid(wide), grid(paper_layout().area) * [1.5, 0.75])
     inner_mm = np.random.default_rng(0).uniform(-1, 1, (500, 2)) * [12.0, 6.0]
     octagon = (np.abs(inner_mm) / [12.0, 6.0]).sum(axis=1) <= 1.5
     found = law.inside(inner_mm, wide)

@@ -55,13 +55,14 @@ def test_drawn_parameters_have_the_given_spreads_and_bounds():
 
 
 def test_presses_cover_the_grid_and_stay_on_the_skin():
-    place_mm = draw_places(rng_for(2, "places"))
+    place_mm = draw_places(rng_for(2, "places"), SETUP.area)
     assert place_mm.shape == (2 * PLACES_N, 2)
-    assert inside(place_mm).all()
+    assert inside(place_mm, SETUP.area).all()
     # Places are points of the grid with a random offset. The limit is six standard deviations of this offset.
-    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3
-    assert len(np.unique(grid(), axis=0)) == PLACES_N
-    assert inside(grid()).all()
+    grid_mm = grid(SETUP.area)
+    assert np.abs(place_mm[:PLACES_N] - grid_mm).max() < 0.3
+    assert len(np.unique(grid_mm, axis=0)) == PLACES_N
+    assert inside(grid_mm, SETUP.area).all()
 
 
 def test_fields_are_proportional_to_the_density_of_filler_which_varies_along_the_skin(monkeypatch):
