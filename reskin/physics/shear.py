@@ -40,7 +40,7 @@ def drag_force(
     path_m: Float[np.ndarray, "t 2"],
     normal_N: Float[np.ndarray, " t"],
     *,
-    stiffness_N_per_m: Float[np.ndarray, "t 2 2"] | Float[np.ndarray, " t"] | float,
+    stiffness_N_per_m: Float[np.ndarray, "t 2 2"],
     friction: float,
 ) -> DragForce:
     """Return the friction force along the path of a tip that touches the skin first at `path_m[0]`.
@@ -55,14 +55,10 @@ def drag_force(
     ----------
     path_m : places of the tip
     normal_N : normal force at each place; 0 if the tip does not touch the skin
-    stiffness_N_per_m : tangential stiffness of the layer, as one number, one number per place, or one symmetric matrix
-        per place
+    stiffness_N_per_m : tangential stiffness of the layer at each place, a symmetric matrix
     friction : friction coefficient mu
     """
-    stiffness = np.asarray(stiffness_N_per_m, dtype=float)
-    if stiffness.ndim < 3:
-        stiffness = np.where(np.eye(2, dtype=bool), np.broadcast_to(stiffness, normal_N.shape)[:, None, None], 0.0)
-    _check_drag(path_m, normal_N, stiffness, friction)
+    _check_drag(path_m, normal_N, stiffness_N_per_m, friction)
     limit_N, in_contact = friction * normal_N, normal_N > 0
     force_N, elastic_m = np.zeros(path_m.shape), np.zeros(path_m.shape)
     sliding = np.zeros(len(path_m), dtype=bool)
@@ -70,10 +66,10 @@ def drag_force(
         if not (in_contact[now] and in_contact[now - 1]):
             continue
         trial_m = elastic_m[now - 1] + path_m[now] - path_m[now - 1]
-        trial_N = np.hypot(*(stiffness[now] @ trial_m))
+        trial_N = np.hypot(*(stiffness_N_per_m[now] @ trial_m))
         sliding[now] = trial_N > limit_N[now]
         elastic_m[now] = trial_m * (limit_N[now] / trial_N) if sliding[now] else trial_m
-        force_N[now] = stiffness[now] @ elastic_m[now]
+        force_N[now] = stiffness_N_per_m[now] @ elastic_m[now]
     return DragForce(force_N, elastic_m, sliding)
 
 

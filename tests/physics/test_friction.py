@@ -19,6 +19,12 @@ paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st
 frictions = st.floats(0, 2)
 
 
+def drag(path_m, normal_N, stiffness_N_per_m, mu):
+    """Drag a tip over a layer with the same stiffness along x and y: one number, or one number for each place."""
+    matrices = np.where(np.eye(2) > 0, np.broadcast_to(stiffness_N_per_m, len(path_m))[:, None, None], 0.0)
+    return drag_force(path_m, normal_N, stiffness_N_per_m=matrices, friction=mu)
+
+
 def constant_force_N(path_m, force_N=1.0):
     return np.full(len(path_m), force_N)
 
@@ -30,14 +36,14 @@ def slipped_m(path_m, found):
 @given(st.floats(1e-6, 1e-2), st.floats(1e-3, 5), st.floats(1e-3, 2), st.floats(0, 5e3), st.integers(1, 50))
 def test_force_of_a_straight_drag_is_the_smaller_of_spring_force_and_friction(end_m, normal_N, mu, stiffness, steps_n):
     path_m = np.column_stack([np.linspace(0, end_m, steps_n + 1), np.zeros(steps_n + 1)])
-    found = drag_force(path_m, constant_force_N(path_m, normal_N), stiffness_N_per_m=stiffness, friction=mu)
+    found = drag(path_m, constant_force_N(path_m, normal_N), stiffness, mu)
     truth_N = np.minimum(stiffness * path_m[:, 0], mu * normal_N)
     np.testing.assert_allclose(found.force_N[:, 0], truth_N, atol=ROUNDING * mu * normal_N)
 
 
 @given(paths_m)
 def test_tip_with_infinite_friction_acts_as_a_spring(path_m):
-    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=1e6)
+    found = drag(path_m, constant_force_N(path_m), K, 1e6)
     np.testing.assert_allclose(found.force_N, K * (path_m - path_m[0]), atol=ROUNDING * K * 1e-2)
     assert not found.sliding.any()
 
@@ -47,7 +53,7 @@ def test_tangential_force_is_never_above_the_friction_limit(path_m, mu, data):
     t = len(path_m)
     normal_N = data.draw(arrays(float, t, elements=st.floats(0, 5)))
     stiffness = data.draw(arrays(float, t, elements=st.floats(0, 5e3)))
-    found = drag_force(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu)
+    found = drag(path_m, normal_N, stiffness, mu)
     size_N = np.hypot(*found.force_N.T)
     # The absolute tolerance is for subnormal numbers, which have fewer digits.
     assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()
@@ -64,7 +70,7 @@ def test_loop_dissipates_friction_force_times_sliding_length():
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
     )
     path_m = np.append(along_m, reach_m)[:, None] * [0.8, 0.6]
-    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
+    found = drag(path_m, constant_force_N(path_m), K, mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
     # A loop has a length of 4 reaches. At each of the two reversals, the tip sticks while the spring changes from one
@@ -80,7 +86,7 @@ def test_loop_dissipates_friction_force_times_sliding_length():
 
 def test_lifting_the_tip_relaxes_the_spring():
     path_m = np.array([[0.0, 0.0], [0.5e-3, 0.0], [5e-3, 0.0], [9e-3, 1e-3], [9.1e-3, 1e-3]])
-    found = drag_force(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), stiffness_N_per_m=K, friction=0.8)
+    found = drag(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), K, 0.8)
     np.testing.assert_allclose(found.force_N, [[0, 0], [0.5, 0], [0, 0], [0, 0], [0.1, 0]], atol=1e-12)
     assert not found.force_N[2:4].any()
     assert not found.sliding.any()
@@ -95,12 +101,12 @@ def test_lifting_the_tip_relaxes_the_spring():
         ("normal force", {"normal_N": np.array([np.nan, 1.0])}),
         ("stiffness", {"stiffness_N_per_m": -1.0}),
         ("stiffness", {"stiffness_N_per_m": np.array([K, np.inf])}),
-        ("friction", {"friction": -0.1}),
-        ("friction", {"friction": np.nan}),
-        ("friction", {"friction": np.inf}),
+        ("friction", {"mu": -0.1}),
+        ("friction", {"mu": np.nan}),
+        ("friction", {"mu": np.inf}),
     ],
 )
 def test_invalid_drags_are_refused(what, of):
-    fine = {"path_m": np.zeros((2, 2)), "normal_N": np.ones(2), "stiffness_N_per_m": K, "friction": 0.8}
+    fine = {"path_m": np.zeros((2, 2)), "normal_N": np.ones(2), "stiffness_N_per_m": K, "mu": 0.8}
     with pytest.raises(ParamsError, match=f"drag: {what} must be"):
-        drag_force(**(fine | of))
+        drag(**(fine | of))
