@@ -704,8 +704,7 @@ def record(
     from reskin.live.record import record_board
     from reskin.recordings.labels import from_program
 
-    given = {"board": board, "skin": skin, "scan": scan}
-    names = {key: name for key, name in given.items() if name is not None}
+    names = {"board": board, "skin": skin, "scan": scan}
     detected = find_board(None if port is None else [port])
     folder = Path(out) if out is not None else None
     result = record_board(detected, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)

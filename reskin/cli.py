@@ -259,11 +259,9 @@ def record(
         given_wire = read_wire(wire or "binary")
         own_n = given_wire.chips_n if isinstance(given_wire, CustomWire) else 5
         detected = DetectedBoard(port, None, given_wire, chips_n or own_n)
-    given = {"board": board, "skin": skin, "scan": scan}
-    names = {key: name for key, name in given.items() if name is not None}
     result = record_board(
-        detected, label_of, folder=out, seconds=seconds, baud=baud, names=names,
-        source="simulated" if simulated else "recorded",
+        detected, label_of, folder=out, seconds=seconds, baud=baud,
+        names={"board": board, "skin": skin, "scan": scan}, source="simulated" if simulated else "recorded",
     )  # fmt: skip
     typer.echo(result.summary)
     if result.error is not None:

@@ -77,7 +77,7 @@ def record_board(
     folder: Path | None = None,
     seconds: float = float("inf"),
     baud: int = BAUD,
-    names: Mapping[str, str] | None = None,
+    names: Mapping[str, str | None] | None = None,
     source: Source = "recorded",
 ) -> RecordingResult:
     """Record a board until the user stops it, `seconds` have passed, the labels end, or the board is unplugged.
@@ -87,13 +87,13 @@ def record_board(
     folder : folder that is created for the capture; captures/DATE-TIME by default
     baud : baud rate, which USB ports ignore
     names : values for the capture's header: the keys `board` and `skin` have the names of the board and the skin, and
-        the key `scan` has the order of the places
+        the key `scan` has the order of the places; None if a value is unknown
     source : "simulated" if an emulated board sends a simulation to the port
     """
     check_name(board.port)  # before a folder is created
     folder, health = folder or new_folder(), Health(board.chips_n)
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
-    stated: dict[str, Any] = scan | dict(names or {})
+    stated: dict[str, Any] = scan | {key: name for key, name in (names or {}).items() if name is not None}
     info = CaptureInfo(**stated, labels=labels, source=source)
     settings = PortSettings(baud, board.wire, board.chips_n, seconds, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S)
     stream, labels_summary, error = record_capture(
