@@ -463,17 +463,13 @@ def _describe_log(counts: Mapping[str, Any]) -> str:
         described += f" ({shifted:.0f} % if all places are shifted by the mean error)"
         if "rms_force_N" in counts:
             described += f", RMS error of the force {counts['rms_force_N']:.2f} N"
-        return _with_faults(described, counts)
-    described = (
-        f"{counts['readings_n']} readings in {counts['duration_s']:.1f} s ({counts['rate_hz']:.1f} Hz), "
-        f"{counts['contacts_n']} contacts in {counts['contact_readings_n']} of them"
-    )
-    if "force_max_N" in counts:
-        described += f", up to {counts['force_max_N']:.2f} N"
-    return _with_faults(described, counts)
-
-
-def _with_faults(described: str, counts: Mapping[str, Any]) -> str:
+    else:
+        described = (
+            f"{counts['readings_n']} readings in {counts['duration_s']:.1f} s ({counts['rate_hz']:.1f} Hz), "
+            f"{counts['contacts_n']} contacts in {counts['contact_readings_n']} of them"
+        )
+        if "force_max_N" in counts:
+            described += f", up to {counts['force_max_N']:.2f} N"
     faults = {key: n for key, n in counts.items() if key not in USUAL_COUNTS and not isinstance(n, list) and n}
     return "; ".join([described, *(f"{key} {n:.6g}" for key, n in faults.items())])
 
