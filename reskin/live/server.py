@@ -12,13 +12,16 @@ import asyncio
 import errno
 import hmac
 import json
+import logging
 import re
 import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, gaierror, gethostname
 from socket import socket as Socket
+from typing import Any
 
 from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
@@ -74,6 +77,7 @@ class Server:
 
     async def run(self, host: str, http_port: int, say: Callable[[], None]) -> None:
         """Serve the page until the process is interrupted. Call `say` as soon as the server listens."""
+        asyncio.get_running_loop().set_exception_handler(_log_unless_table_is_full)
         runner = web.AppRunner(self.application(), handle_signals=True, keepalive_timeout=KEPT_ALIVE_S)
         await runner.setup()
         try:
@@ -170,6 +174,20 @@ def receive(session: Session, text: str) -> None:
         message = json.loads(text)
         if isinstance(message, dict):
             session.request(message)
+
+
+def _log_unless_table_is_full(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Handle an error of the event loop. An error because too many files are open is logged once, in one line."""
+    error = context.get("exception")
+    if not isinstance(error, OSError) or error.errno not in (errno.EMFILE, errno.ENFILE):
+        loop.default_exception_handler(context)
+    else:
+        _log_once(f"too many open files: connections to the page must wait ({error.strerror})")
+
+
+@cache
+def _log_once(message: str) -> None:
+    logging.getLogger(__name__).warning(message)
 
 
 def address_of(host: str) -> str:
