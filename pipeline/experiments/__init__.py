@@ -1,6 +1,6 @@
-"""Experiments, each with one module (settings, computation, tables, figures) and one YAML file of the same name.
+"""Experiments, one module each: settings, the function of the stage, the summary of its numbers, and its figures.
 
-For example, `shear.py` defines the function `shear`, which runs as stage `shear`, and the functions `tables` and
-`figures`, which the report calls. `shear.yaml` states what a scene needs to run the experiment (`experiment`, see
-`pipeline.catalogue`). The claims of the paper that its numbers decide are in `pipeline/report/claims.yaml`.
+For example, `shear.py` defines the function `shear`, which runs as stage `shear`, and `figures`, which the report
+calls. `pipeline.catalogue` states what a scene needs to run an experiment. Tables are in `pipeline/report/tables.py`,
+and the claims of the paper that the numbers decide are in `pipeline/report/claims.yaml`.
 """

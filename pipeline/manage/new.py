@@ -59,7 +59,7 @@ ABOUT_MODEL = """\
 ONE_BOARD = (
     "two or more boards are needed, because one board cannot be held out and also be trained on. To train on the "
     "first passes over one board and test on its last passes, copy pipeline/scenes/ini.yaml instead. Or use the "
-    "universal model, which needs no training: see docs/live.md, Calibrate the universal model"
+    "universal model, which needs no training: see docs/live.md, Calibrate the model"
 )
 
 

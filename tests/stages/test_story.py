@@ -180,7 +180,7 @@ def test_each_capture_has_a_parquet_file_with_units(story):
 def test_score_equals_the_score_computed_by_a_naive_loop(story):
     card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
     predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
-    predicted = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
+    predicted = [row for row in predictions if (row["recipe"], row["fold"], row["seed_i"]) == ("paper", "b1", 0)]
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
