@@ -65,7 +65,10 @@ ORIENTATIONS = {
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
-    """Check and write a prepared recording, track it with DVC, and register it; on failure, undo all of this."""
+    """Check and write a prepared recording, track it with DVC, and register it; on failure, undo all of this.
+
+    Prints numbers of readings and indentations, and warnings.
+    """
     header, files = prepared
     copy = f"cp {SCENES}/ini.yaml {SCENES}/{scene}.yaml"
     remedy = f"To create it, run reskin new {scene} --boards ..., or copy a scene: {copy}."
@@ -102,6 +105,10 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         _track(target, root)
         write_registry(root, after)
         _update_plan(root, scene, after)
+    say(
+        f"{complete.capture}: {counts.readings_n} readings in contact, {counts.indentations_n} indentations, "
+        f"{counts.passes_n} passes"
+    )
     if lost := complete.options.get("lost"):
         say(f"warning: the recording of capture {complete.capture} was interrupted. Lost: {lost}.")
     if "compare" in (settings.model_extra or {}):
@@ -185,8 +192,9 @@ def _check_free(target: Path, registered: bool) -> None:
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of passes and of indentations in a capture, and whether anything touches the skin."""
+    """Numbers of readings in contact, passes and indentations of a capture, and whether anything touches the skin."""
 
+    readings_n: int
     passes_n: int
     indentations_n: int
     touched: bool
@@ -237,7 +245,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
             "the chips, run: reskin ports --rate. The recording was added anyway."
         )
     fingerprints = (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
-    return fingerprints, Counts(len(passes), len(indentations), touched)
+    return fingerprints, Counts(rows_n, len(passes), len(indentations), touched)
 
 
 def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:

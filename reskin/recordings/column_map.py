@@ -37,10 +37,14 @@ Names = str | tuple[str, ...]
 
 
 class Column(Strict):
-    """One or several columns of the file, which are added up, such as seconds and nanoseconds."""
+    """One or several columns of the file, which are added up, such as seconds and nanoseconds.
+
+    With `format` (as of `datetime.strptime`), the columns are parts of one text with date and time, joined by spaces.
+    """
 
     of: Names
     unit: Names | None = None
+    format: str = ""
     sign: Literal[1, -1] = 1
 
 
@@ -112,6 +116,7 @@ def convert(recording: Path, columns: ColumnMap, where: str = "") -> pa.Table:
     # Columns of numbers and of other values are read separately, because a column may be both, such as a load that also
     # tells contact.
     others = [of for of, factor in parts if factor is None] + [fields.of] * listed + [of_phase] * by_value
+    formats = {name: column.format for name, column in columns.columns.items() if isinstance(column, Column)}
     cells = file.read([], others)
     lists = _listed(cells[fields.of], where) if listed else np.zeros((0, 0))
     channels = [] if listed else _channels(fields, file.names)
@@ -125,9 +130,12 @@ def convert(recording: Path, columns: ColumnMap, where: str = "") -> pa.Table:
         made[f"B{'xyz'[i % 3]}{i // 3}"] = UNITS["uT"][fields.unit] * fields.signs[i % 3] * values
     made |= {f"T{i}": data[name] for i, name in enumerate(temperatures)}
     for name, column in columns.columns.items():
+        if format := formats.get(name):
+            made[name] = _seconds([cells[of] for of, _ in sources[name]], format, where)
+            continue
         total = np.zeros(len(data))
         for of, factor in sources[name]:
-            total += _seconds(cells[of], where) if factor is None else factor * np.asarray(data[of])
+            total += _seconds([cells[of]], ISO, where) if factor is None else factor * np.asarray(data[of])
         made[name] = total if isinstance(column, str) else column.sign * total
     of_contact = (cells if by_value else data)[of_phase]
     contact = contact_rows(of_contact, where) if isinstance(phase, str) else _contact(of_contact, phase, where)
@@ -139,6 +147,10 @@ def _factors(name: str, column: str | Column, where: str) -> list[tuple[str, flo
     """Return the source columns of a column with their factors; None for times that are written as date and time."""
     column = Column(of=column) if isinstance(column, str) else column
     names, usual = (column.of,) if isinstance(column.of, str) else column.of, UNIT_OF[name]
+    if column.format:
+        if usual != "s" or column.unit is not None:
+            raise ParamsError(f"{where}: {name}: `format` is for t_s, and without a unit.")
+        return [(of, None) for of in names]
     units = column.unit if isinstance(column.unit, tuple) else (column.unit or usual,) * len(names)
     if len(units) != len(names):
         raise ParamsError(f"{where}: {name}: {len(names)} columns, but {len(units)} units. State a unit for each.")
@@ -204,11 +216,15 @@ def _plain(value: object) -> str:
     return re.sub(r"\.0$", "", str(value).strip().lower())
 
 
-def _seconds(column: pa.ChunkedArray, where: str) -> Float64[np.ndarray, " f"]:
-    """Return times that are written as date and time in s since the first."""
+def _seconds(columns: Sequence[pa.ChunkedArray], format: str, where: str) -> Float64[np.ndarray, " f"]:
+    """Return times that are written as date and time, in one or several columns, in s since the first."""
+    texts = [" ".join(map(str, row)).strip() for row in zip(*(column.to_pylist() for column in columns), strict=True)]
     try:
-        times = [datetime.fromisoformat(str(value).strip()) for value in column.to_pylist()]
+        times = [datetime.fromisoformat(text) if format == ISO else datetime.strptime(text, format) for text in texts]
     except ValueError as error:
-        raise CaptureError(f"{where}: {str(error)[:100]}. State times as YYYY-MM-DDTHH:MM:SS.") from None
+        raise CaptureError(
+            f"{where}: {str(error)[:100]}. Write t_s as YYYY-MM-DDTHH:MM:SS, or state its columns and their format in "
+            'the map, such as t_s: {of: [date, time], format: "%d.%m.%Y %H:%M:%S,%f"}, or leave t_s out.'
+        ) from None
     times = [time if time.tzinfo else time.replace(tzinfo=UTC) for time in times]
     return np.array([(time - times[0]).total_seconds() for time in times])

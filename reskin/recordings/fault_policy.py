@@ -269,7 +269,7 @@ class FaultLog:
             rule = rule if expected_lsb_uT is None else f"{expected_lsb_uT} uT"
             remedy = (
                 "A chip has probably lost its settings. Reset the board, so that its firmware configures the chips "
-                "again, and record again."
+                "again, and record again; or keep the rows with faults: chip_reset: flag in params.yaml."
             )
             raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
         if wrong.any():

@@ -64,7 +64,10 @@ def check_fields(
     may_be_gauss = subtracted or usual_uT < GAUSS_MAX
     if step_uT > NANO_STEP_MIN or (may_be_gauss and step_uT < chips.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "mT or G" if subtracted else "G"
-        remedy = f"The unit is probably {unit}. Convert the fields to uT."
+        remedy = (
+            f"The unit is probably {unit}. Convert the fields to uT. If they are in uT, add the steps of the chip to "
+            "reskin/board/chips.py."
+        )
         raise CaptureError(where, "the step between values of the field", STEP_RULE, f"{step_uT:.3g}", remedy)
 
 

@@ -110,9 +110,22 @@ def test_times_may_be_dates(tmp_path):
     np.testing.assert_allclose(found.t_s, np.arange(6))
 
 
+def test_date_and_time_may_be_in_two_columns_of_any_format(tmp_path):
+    data = renamed().drop(columns="t_s").assign(Datum="04.03.2025", Zeit=[f"09:30:0{i},250" for i in range(6)])
+    data.to_csv(tmp_path / "a.csv", index=False)
+    in_map = 't_s: {of: [Datum, Zeit], format: "%d.%m.%Y %H:%M:%S,%f"}'
+    np.testing.assert_allclose(
+        converted(tmp_path, tmp_path / "a.csv", SAME.replace("t_s: t_s", in_map)).t_s, np.arange(6)
+    )
+    for wrong in (in_map.replace(",%f", ""), "t_s: {of: Datum, unit: iso}"):
+        with pytest.raises(CaptureError, match=r"Write t_s as YYYY-MM-DDTHH:MM:SS, or state .* format"):
+            converted(tmp_path, tmp_path / "a.csv", SAME.replace("t_s: t_s", wrong))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (("Fz_N: Fz_N", 'Fz_N: {of: Fz_N, format: "%S"}'), "Fz_N: `format` is for t_s"),
         (("x_mm: x_mm", "x_mm: X"), "no column 'X'; the file has phase, x_mm"),
         (("Fz_N: Fz_N", "Fz_N: {of: Fz_N, unit: pound}"), "Fz_N: unit pound is not one of N, mN, kN, g, kg"),
         (("Fz_N: Fz_N", "Fn_N: Fz_N"), "Fn_N is not one of x_mm, y_mm"),
