@@ -8,6 +8,7 @@ import os
 import re
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -247,11 +248,14 @@ class Terminal:
             raise ParamsError(f"--port: {link} is an existing file, not a link. Choose another name.")
         self._link = link
         self._open_ends: tuple[int, ...] = ()
+        self.opened = False  # whether a reader has opened the port; `play` sets this to False again
         self.plug_in()
 
     def plug_in(self) -> None:
         """Create the pseudo-terminal and the link."""
-        import tty  # this module does not exist on Windows
+        import fcntl
+        import termios
+        import tty  # these modules do not exist on Windows
 
         if self._link is not None and self._link.is_symlink() and self._link.exists():
             raise ParamsError(
@@ -260,6 +264,10 @@ class Terminal:
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
+        # When a reader opens the pseudo-terminal, the reader discards all data in the buffer of the pseudo-terminal. In
+        # packet mode, this process is informed when data are discarded, and so notices that the port was opened.
+        fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
+        self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
         self.name = os.ttyname(self._near)
         if self._link is not None:
@@ -283,8 +291,9 @@ class Terminal:
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
+                # The first byte is the packet status. The other bytes are data from the reader, which are ignored.
                 if readable:
-                    os.read(self._far, 4096)  # data from the reader are ignored
+                    self.opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])
         return sent_n
@@ -294,7 +303,7 @@ class TcpServer:
     """A TCP server on this machine that serves one reader at a time, at `socket://127.0.0.1:PORT`."""
 
     def __init__(self, number: int = 0) -> None:
-        self._number = number
+        self._number, self.opened = number, False
         self.plug_in()
 
     def plug_in(self) -> None:
@@ -318,6 +327,7 @@ class TcpServer:
             try:
                 if self._client is None:
                     self._client = self._server.accept()[0]
+                    self.opened = True
                     self._client.settimeout(TICK_S)
                 sent_n += self._client.send(data[sent_n:])
             except TimeoutError:
@@ -368,7 +378,7 @@ def play(
     script, port : what is sent, and where
     stop : event that another thread sets to end sending
     speed : factor by which all due times are divided. With `math.inf`, the script is sent as fast as the reader reads.
-    loop : whether the script starts again at its end
+    loop : whether the script starts again at its end, and whenever a reader opens the port
     on_sent : function that is called after each batch with the indices of the pieces in the batch
 
     Returns
@@ -389,6 +399,9 @@ def play(
             first, i = i, i + min(max(overdue_n, 1), BATCH_MAX_N)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
             on_sent(range(first, i))
+            if port.opened and loop:
+                i, start_s = 0, time.monotonic()
+            port.opened = False
         if not loop:
             break
         start_s += script.duration_s / speed

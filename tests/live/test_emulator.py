@@ -54,6 +54,8 @@ class SimulatedClock:
 class FakeReader:
     """A reader that records when each frame arrives. After frame `late_i`, it pauses once, for `late_s`."""
 
+    opened = False
+
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
 
@@ -86,6 +88,28 @@ def test_no_byte_is_lost_while_nobody_reads_from_the_open_port(port):
     end.unplug()
     assert data == sent
     assert sent_bytes_n == [len(sent)]
+
+
+@pytest.mark.parametrize("port", ["pty", "tcp"])
+def test_emulated_board_starts_again_when_its_port_is_reopened(port):
+    # When a port is opened, bytes that wait there are discarded, so some of the first frames may be missing.
+    script = make_script(pokes_n=2)
+    end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
+    player = threading.Thread(target=play, args=[script, end, stop], kwargs={"loop": True})
+    player.start()
+    restarted = []
+    for _ in range(2):
+        with open_port(end.name, 115200) as device:
+            data = b""
+            # The loop reads enough bytes to distinguish a stream that begins again from one that continues.
+            while len(data) < 8 * len(early):
+                data += read_waiting(device)
+        restarted.append(early in data)
+    stop.set()
+    player.join()
+    end.unplug()
+    assert len(script) > 800
+    assert all(restarted)
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
