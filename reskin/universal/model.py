@@ -499,7 +499,8 @@ class Universal:
         With `changes`, `b_uT` contains field changes, from which no no-load reading is subtracted.
 
         Contact is unknown if `zero` got fewer than `QUIET_MIN_N` readings, or if external fields are expected. Without
-        contact, place and force mean nothing.
+        contact, place and force mean nothing. Before `label` got about ten forces, `sd_N` is too small on recorded
+        boards (docs/learning.md, Intervals).
         """
         db_uT = self._change(b_uT, changes)
         estimate = self.skin.estimate(db_uT)
