@@ -123,7 +123,8 @@ def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
 
     Such readings come from lines whose digits were cut. In a single reading, any channels may be far from their median,
     because no press is that short. In up to `JUMP_WINDOW_N // 2` successive readings, exactly one channel of a board of
-    several chips may be, because a press changes several channels.
+    several chips may be, because a press changes several channels. In both cases, the reading must be further off than
+    the readings around it change, because a channel may be far off its median while a press begins or ends.
 
     Two doors do not use this: rows of a table may be single readings of different presses, and the estimate of a live
     board cannot wait for the next readings.
@@ -145,8 +146,13 @@ def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
     off_uT[rows] = np.abs(b_uT[rows] - np.median(b_uT[windows], axis=1))
     far, off = (off_uT > far_uT).sum(axis=1), (off_uT > near_uT).sum(axis=1)
     beside = np.pad(off, 1)
-    jumps = (far > 0) & (beside[:-2] == 0) & (beside[2:] == 0)
-    return np.asarray(jumps | ((far == 1) & (off == 1) & (b_uT.shape[1] > 3)))
+    alone = (far > 0) & (beside[:-2] == 0) & (beside[2:] == 0)
+    single = (far == 1) & (off == 1) & (b_uT.shape[1] > 3)
+    # How far the other readings around change, in the channel that changes most but for one: much while a press begins.
+    changes_uT = np.zeros(len(b_uT))
+    others = np.delete(windows, JUMP_WINDOW_N // 2, axis=1)
+    changes_uT[rows] = np.sort(np.ptp(b_uT[others], axis=1), axis=1)[:, max(-2, -b_uT.shape[1])]
+    return np.asarray((alone | single) & (off_uT.max(axis=1) > changes_uT))
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:

@@ -179,3 +179,16 @@ class TestStuck:
     def test_no_fault_is_found_on_a_real_working_board(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")
         assert not stuck_chips(b_uT).any()
+
+
+def test_readings_while_a_press_begins_are_no_jumps_but_cut_digits_are():
+    rng = np.random.default_rng(1)
+    shape = np.repeat(rng.uniform(100.0, 700.0, 15)[None], 60, axis=0) * rng.choice([-1.0, 1.0], 15)
+    begin = np.concatenate([np.zeros(20), [0.35, 0.9], np.ones(16), [0.8, 0.4], np.zeros(20)])
+    b_uT = 1000.0 + begin[:, None] * shape + 3.0 * rng.standard_normal((60, 15))
+    b_uT[:, 4] = 1000.0 + np.where(begin > 0, 55.0, 0.0)
+    b_uT[[21, 38], 4] += 65.0  # overshoots, as a chip does whose field turns while the tip goes down
+    assert not faults.lone_jumps(b_uT).any()
+    cut = b_uT.copy()
+    cut[10, 2], cut[30, 7], cut[50] = 100.0, -3.0, b_uT[50] / 10  # one channel at rest and in the press; a whole line
+    assert np.flatnonzero(faults.lone_jumps(cut)).tolist() == [10, 30, 50]
