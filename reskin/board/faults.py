@@ -148,7 +148,7 @@ def lone_jumps(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
     beside = np.pad(off, 1)
     alone = (far > 0) & (beside[:-2] == 0) & (beside[2:] == 0)
     single = (far == 1) & (off == 1) & (b_uT.shape[1] > 3)
-    # How far the other readings around change, in the channel that changes most but for one: much while a press begins.
+    # The second largest change of a channel in the readings around. It is large while a press begins or ends.
     changes_uT = np.zeros(len(b_uT))
     others = np.delete(windows, JUMP_WINDOW_N // 2, axis=1)
     changes_uT[rows] = np.sort(np.ptp(b_uT[others], axis=1), axis=1)[:, max(-2, -b_uT.shape[1])]

@@ -181,7 +181,7 @@ class Session:
         self._model_name, self._alone, self._emulated, self._skins = model_name, alone, emulated, skins or SkinFolder()
         self.traces: Traces | None = None
         self._error = ""
-        self._task: Presses | NextPress | None = None  # the presses that the user is asked for
+        self._task: Presses | NextPress | None = None  # what the user is asked to press now
         self._doubtful_press: LabelledPress | None = None  # contradicts the model; the user may keep or discard it
         self._adapted = self._labelled = ""  # texts for the user about the last calibration and the last labelled press
         self._recording: PageRecording | None = None

@@ -199,7 +199,7 @@ def write_onnx(network: Network, file: Path) -> None:
 
 def build_onnx(network: Network) -> "ModelProto":
     """Build the ONNX model of a network, with the same steps as `Network.__call__`."""
-    g = Graph(np.float32)  # the first statement, because it refuses to run without package onnx
+    g = Graph(np.float32)  # first, so that a missing package onnx is reported at once
 
     from reskin.models.network import LAYERS  # imported here, because it imports torch
 
